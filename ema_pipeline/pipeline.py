@@ -36,9 +36,7 @@ def run_stages(run: Run, names: Iterable[str], show: ShowStage | None = None) ->
     computed: list[str] = []
     names = tuple(names)
     keys = Keys(run, names)
-    there = stages_of(run)
-    stages = [stage_module(name) for name in names if name in there]
-    for each, group in groupby(stages, key=lambda stage: stage.PER_CONFIGURATION):
+    for each, group in groupby(_stages(run, names), key=lambda stage: stage.PER_CONFIGURATION):
         chain = list(group)
         apart = each and can_fork() and run.settings.processes != 1
         computed += _side_by_side(chain, run, keys, show) if apart else _in_turn(chain, run, keys, show)
@@ -48,25 +46,31 @@ def run_stages(run: Run, names: Iterable[str], show: ShowStage | None = None) ->
 def out_of_date(run: Run, names: Iterable[str]) -> list[str]:
     """What `run_stages` would compute."""
     names = tuple(names)
-    keys, there = Keys(run, names), stages_of(run)
-    return [
-        _label(stage, configuration)
-        for stage in (stage_module(name) for name in names if name in there)
-        for configuration in configurations_of(stage, run)
-        if not _up_to_date(stage, run, configuration, keys(stage.NAME, configuration))
-    ]
+    return [_label(stage, c) for stage, c, _ in _stale(_stages(run, names), run, Keys(run, names))]
+
+
+def _stages(run: Run, names: Iterable[str]) -> list[Stage]:
+    """The stages of these names that a run of this kind has."""
+    there = stages_of(run)
+    return [stage_module(name) for name in names if name in there]
+
+
+def _stale(stages: Iterable[Stage], run: Run, keys: Keys) -> Iterator[tuple[Stage, str, str]]:
+    """Stages that are out of date, with configuration and key, each asked about when it is its turn."""
+    for stage in stages:
+        for configuration in configurations_of(stage, run):
+            key = keys(stage.NAME, configuration)
+            if not _up_to_date(stage, run, configuration, key):
+                yield stage, configuration, key
 
 
 def _in_turn(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | None) -> list[str]:
     """Run the stages that are out of date one after the other."""
     computed = []
-    for stage in stages:
-        for configuration in configurations_of(stage, run):
-            key = keys(stage.NAME, configuration)
-            if not _up_to_date(stage, run, configuration, key):
-                label = _label(stage, configuration)
-                _run_one(stage, run, configuration, key, label, show)
-                computed.append(label)
+    for stage, configuration, key in _stale(stages, run, keys):
+        label = _label(stage, configuration)
+        _run_one(stage, run, configuration, key, label, show)
+        computed.append(label)
     return computed
 
 
@@ -76,8 +80,7 @@ def _side_by_side(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | N
     No configuration asks for results of another, so that all are the same as one after the other. One alone has its own
     process, too: what its stages needed does not burden those that follow.
     """
-    wanted = [(stage, c, keys(stage.NAME, c)) for stage in stages for c in run.info.configurations]
-    todo = [(stage, c, key) for stage, c, key in wanted if not _up_to_date(stage, run, c, key)]
+    todo = list(_stale(stages, run, keys))
     names = list(dict.fromkeys(c for _, c, _ in todo))
     processes = min(run.settings.processes or cores(), len(names))
 

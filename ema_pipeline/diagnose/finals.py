@@ -58,7 +58,7 @@ def spread_fits(
 def leading(order: Sequence[tuple[Hypothesis, Fit]], base: Fit) -> list[tuple[Hypothesis, Fit]]:
     """What is a finalist by its fit at wide scatters, best first."""
     gaining = [pair for pair in order[_AT_LEAST:FINALISTS] if pair[1].log_evidence > base.log_evidence]
-    least = max(base.log_evidence + PROMISING, *(fit.log_evidence - _TIED for _, fit in order[:1]), -np.inf)
+    least = max([base.log_evidence + PROMISING, *(fit.log_evidence - _TIED for _, fit in order[:1])])
     tied = [pair for pair in order[FINALISTS:_MOST] if pair[1].log_evidence > least]
     return [*order[:_AT_LEAST], *gaining, *tied]
 

@@ -16,7 +16,6 @@ from scipy.stats import f as variance_ratio
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.modal.low_rank import first_right, low_rank
 from ema_pipeline.modal.plain_residues import FALSE_ALARM, FEWEST_PEAKS, PlainResidues
 
 Real = NDArray[np.float64]
@@ -157,12 +156,9 @@ def channel_delays(frfs: FrfSet, found: Sequence[PlainResidues]) -> ChannelDelay
 def _phases(found: Sequence[PlainResidues]) -> _Phases:
     doubled, weight = [], []
     for peak in found:
-        inverse = 1 / peak.variance
-        left, right = low_rank(peak.residues, inverse, first_right(peak.residues, 1), ALTERNATIONS)
-        known = np.isfinite(peak.variance)
-        free = max(int(np.count_nonzero(known)) - sum(known.shape) + 1, 1)
-        level = max(float(np.sum(inverse * np.abs(peak.residues - left @ right) ** 2)) / free, 1.0)
-        information = np.abs(left[:, 0]) ** 2 @ inverse * np.abs(right[0]) ** 2
+        left, right, misfit = peak.rank_one(ALTERNATIONS)
+        level = max(misfit / max(peak.free, 1), 1.0)
+        information = np.abs(left[:, 0]) ** 2 @ (1 / peak.variance) * np.abs(right[0]) ** 2
         doubled.append(_unit(right[0] ** 2))
         weight.append(
             np.where(information > 0, 1 / (0.5 * level / np.maximum(information, 1e-300) + COMPLEX**2), 0.0)

@@ -20,7 +20,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.low_rank import first_right, low_rank, tangent
 from ema_pipeline.modal.plain_residues import FALSE_ALARM, FEWEST_PEAKS, PlainResidues
-from ema_pipeline.modal.reversals import signs_of
+from ema_pipeline.modal.reversals import signs_of, upright
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -168,8 +168,7 @@ def gain_changes(frfs: FrfSet, found: Sequence[PlainResidues]) -> GainChanges | 
     if min(frfs.hits.shape) < 2 or frfs.hits.size > MOST_CELLS or len(found) < FEWEST_PEAKS:
         return None
     signs = signs_of(found)
-    upright = [(p.residues * signs, p.variance) for p in found]
-    peaks = [_Peak(residues, variance, first_right(residues, 1)) for residues, variance in upright]
+    peaks = [_Peak(p.residues, p.variance, first_right(p.residues, 1)) for p in upright(found, signs)]
     cells, logarithms, covariance = _selected(*_weighed(peaks))
     if not cells and np.all(signs > 0):
         return None

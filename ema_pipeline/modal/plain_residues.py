@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.drift.local import peak_residues
 from ema_pipeline.modal.drift.windows import peak_frfs
+from ema_pipeline.modal.low_rank import first_right, low_rank
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -38,6 +39,23 @@ class PlainResidues:
     omega: float
     residues: Complex
     variance: Real
+
+    @property
+    def free(self) -> int:
+        """Residues beyond those that a matrix of rank one can follow; negative where it follows more."""
+        return int(np.count_nonzero(np.isfinite(self.variance))) - sum(self.variance.shape) + 1
+
+    def rank_one(self, steps: int) -> tuple[Complex, Complex, float]:
+        """The matrix of rank one that fits best: left and right factor, and what it leaves, squared over the variances.
+
+        Parameters
+        ----------
+        steps : int
+            Of alternating least squares.
+        """
+        weight = 1 / self.variance
+        left, right = low_rank(self.residues, weight, first_right(self.residues, 1), steps)
+        return left, right, float(np.sum(weight * np.abs(self.residues - left @ right) ** 2))
 
 
 def plain_residues(frfs: FrfSet, band_hz: tuple[float, float]) -> list[PlainResidues]:

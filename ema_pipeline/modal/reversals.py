@@ -8,11 +8,11 @@ it is a corner of, in every mode. Shapes of the modes have to be known for none 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.low_rank import first_right, low_rank
 from ema_pipeline.modal.plain_residues import FALSE_ALARM, FEWEST_PEAKS, PlainResidues
 
 Complex = NDArray[np.complex128]
@@ -37,11 +37,11 @@ def signs_of(found: Sequence[PlainResidues]) -> Real:
     """
     signs = np.ones(found[0].residues.shape)
     needed = np.log(signs.size / FALSE_ALARM)
-    likelihood = _log_likelihood(found, signs)
+    likelihood = _log_likelihood(upright(found, signs))
     for _ in range(signs.size // 2):
-        worst = np.argsort(_agreement(found, signs), axis=None)[:TRIED]
-        trials = [np.where(np.arange(signs.size) == k, -1.0, 1.0).reshape(signs.shape) * signs for k in worst]
-        after = [_log_likelihood(found, trial) for trial in trials]
+        worst = np.argsort(_agreement(upright(found, signs)), axis=None)[:TRIED]
+        trials = [_turned(signs, int(place)) for place in worst]
+        after = [_log_likelihood(upright(found, trial)) for trial in trials]
         best = int(np.argmax(after))
         if after[best] - likelihood < needed:
             break
@@ -49,14 +49,25 @@ def signs_of(found: Sequence[PlainResidues]) -> Real:
     return signs
 
 
-def _agreement(found: Sequence[PlainResidues], signs: Real) -> Real:
+def upright(found: Sequence[PlainResidues], signs: Real) -> list[PlainResidues]:
+    """Residues as sensors of these signs would have shown them all upright."""
+    return [replace(peak, residues=peak.residues * signs) for peak in found]
+
+
+def _turned(signs: Real, place: int) -> Real:
+    turned = signs.copy()
+    turned.flat[place] *= -1
+    return turned
+
+
+def _agreement(found: Sequence[PlainResidues]) -> Real:
     """Mean over the peaks that see an entry of how its rectangles agree, -1 to 1; 1 where too few do."""
-    total, seen = np.zeros_like(signs), np.zeros_like(signs)
+    total, seen = np.zeros(found[0].residues.shape), np.zeros(found[0].residues.shape)
     for peak in found:
         clear = np.abs(peak.residues) ** 2 > SEEN**2 * peak.variance
-        values = np.where(clear, peak.residues * signs, 0.0)
+        values = np.where(clear, peak.residues, 0.0)
         around, most = _rectangles(values), _rectangles(np.abs(values).astype(complex))
-        total += np.divide(around, most, out=np.zeros_like(signs), where=most > 0)
+        total += np.divide(around, most, out=np.zeros_like(total), where=most > 0)
         seen += most > 0
     return np.where(seen >= FEWEST_PEAKS, total / np.maximum(seen, 1), 1.0)
 
@@ -70,18 +81,11 @@ def _rectangles(values: Complex) -> Real:
     return np.asarray((everywhere - degenerate).real)
 
 
-def _log_likelihood(found: Sequence[PlainResidues], signs: Real) -> float:
-    """Of signs, at the scatter that matrices of rank one leave."""
+def _log_likelihood(found: Sequence[PlainResidues]) -> float:
+    """At the scatter that matrices of rank one leave, at least that of noise."""
     total = 0.0
     for peak in found:
-        free = 2 * (int(np.count_nonzero(np.isfinite(peak.variance))) - sum(signs.shape) + 1)
-        total -= 0.5 * max(free, 0) * float(np.log(_misfit(peak, signs)))
+        _, _, misfit = peak.rank_one(_ALTERNATIONS)
+        noise = float(np.sum(1 / peak.variance > 0))
+        total -= max(peak.free, 0) * float(np.log(max(misfit, noise)))
     return total
-
-
-def _misfit(peak: PlainResidues, signs: Real) -> float:
-    """What a matrix of rank one leaves, over noise; at least 1 for each entry."""
-    values, weight = peak.residues * signs, 1 / peak.variance
-    left, right = low_rank(values, weight, first_right(values, 1), _ALTERNATIONS)
-    off = float(np.sum(weight * np.abs(values - left @ right) ** 2))
-    return max(off, float(np.count_nonzero(weight)))
