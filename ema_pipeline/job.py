@@ -14,11 +14,12 @@ from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.keys import Keys
 from ema_pipeline.kinds import require_judge, stages_of
 from ema_pipeline.pipeline import ShowStage, out_of_date, run_stages
+from ema_pipeline.results_folder import RESULTS_FILE
 from ema_pipeline.run.opening import existing_run, load_info, new_run, stored_settings, with_effect_files
 from ema_pipeline.run.rollback import everything_taken_back, settings_taken_back
 from ema_pipeline.run.settings import override
 from ema_pipeline.run.types import Run, RunInfo
-from ema_pipeline.store import ALL, RESULTS_FILE, CannotWriteError, Store
+from ema_pipeline.store import ALL, CannotWriteError, Store
 
 DescribeSource = Callable[[Path, str | None, str | None, Iterable[str]], RunInfo]
 """Checks what a run starts from; takes source, rig, pipeline and overrides."""
@@ -102,14 +103,7 @@ def run_on(
         try:
             locked.enter_context(store.lock())
         except CannotWriteError:
-            run = existing_run(folder, effect_files)
-            changed = ["settings"] if overrides else out_of_date(run, stages)
-            if changed:
-                raise EmaError(
-                    f"{folder}: cannot be written to, and {changed[0]} would change there; "
-                    "copy the folder to where you can write"
-                ) from None
-            return run, []
+            return _as_it_is(folder, effect_files, stages, overrides), []
         info = existing_run(folder, effect_files).info
         settings = override(stored_settings(store, info), overrides, folder)
         info = dataclasses.replace(info, pipeline=settings.model_dump_json())
@@ -117,6 +111,20 @@ def run_on(
         run.check_effect_files()
         with settings_taken_back(store, info):
             return run, run_stages(run, stages, show)
+
+
+def _as_it_is(
+    folder: Path, effect_files: tuple[str, ...], stages: tuple[str, ...], overrides: tuple[str, ...]
+) -> Run:
+    """The run of a folder that cannot be written to, where nothing would change there."""
+    run = existing_run(folder, effect_files)
+    changed = ["settings"] if overrides else out_of_date(run, stages)
+    if changed:
+        raise EmaError(
+            f"{folder}: cannot be written to, and {changed[0]} would change there; "
+            "copy the folder to where you can write"
+        )
+    return run
 
 
 AFTER_EFFECTS = ("fit", "correlate", "report")

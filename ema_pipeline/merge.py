@@ -28,12 +28,12 @@ from ema_pipeline.job import run_raw
 from ema_pipeline.names import check_name
 from ema_pipeline.number_text import format_percent
 from ema_pipeline.pipeline import ShowStage
+from ema_pipeline.results_folder import RESULTS_FILE
 from ema_pipeline.run.measured import measured_frfs, measured_modes
 from ema_pipeline.run.opening import existing_run
 from ema_pipeline.run.records import accepted_hits
 from ema_pipeline.run.types import Run
 from ema_pipeline.significance import holm
-from ema_pipeline.store import RESULTS_FILE
 from ema_pipeline.toml_text import LARGEST_BYTES
 
 TOLERANCE = 1e-3

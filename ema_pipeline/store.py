@@ -27,21 +27,12 @@ from ema_pipeline import __version__, codec
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import ScratchFile, cannot_write, link_or_copy, reason, replacing
 from ema_pipeline.processes import workers_die_with_us
+from ema_pipeline.results_folder import BEFORE, LOCK_FILE, PARTS_FOLDER, RESULTS_FILE, bring_back_files
 
 T = TypeVar("T")
 
 ALL = "all"
 """Name that stands for all configurations together."""
-
-LOCK_FILE = ".lock"
-RESULTS_FILE = "ema.h5"
-PARTS_FOLDER = "stages"
-
-FILES = (RESULTS_FILE, "summary.json", "modes.csv", "report.html")
-"""Files of a results folder that go back together; large results beside them are never changed."""
-
-BEFORE = ".before."
-"""Begins the name of a folder with these files as they were before a change that is under way."""
 
 LARGE_BYTES = 1_000_000
 """Size from which a result gets a file of its own: below, copying ``ema.h5`` costs less than the files' clutter."""
@@ -392,27 +383,6 @@ class Store:
                 if group is not None:
                     found[stage, configuration] = _provenance(group)
         return found
-
-
-def keep_files(folder: Path, place: Path) -> None:
-    """Keep the files of a results folder as they are, in an empty folder of the same file system."""
-    for name in FILES:
-        if (folder / name).is_file():
-            link_or_copy(folder / name, place / name)
-
-
-def bring_back_files(folder: Path, place: Path) -> None:
-    """Replace the files of a results folder by those that were kept in `place`; new ones go.
-
-    `place` stays whole, so that this can be repeated if it is interrupted.
-    """
-    for name in reversed(FILES):  # the store last: until then the folder is in its later state
-        if (place / name).is_file():
-            with replacing(folder / name) as scratch:
-                scratch.unlink(missing_ok=True)  # what a killed process of the same number left there
-                link_or_copy(place / name, scratch)
-        else:
-            (folder / name).unlink(missing_ok=True)
 
 
 def _group(stage: str, configuration: str) -> str:

@@ -34,10 +34,10 @@ from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report.html import report_html
 from ema_pipeline.report.moved_modes import error_words, moved_table, seen, still
 from ema_pipeline.report.results import RunResults
+from ema_pipeline.results_folder import LOCK_FILE
 from ema_pipeline.run.opening import existing_run
 from ema_pipeline.simulate.campaign import simulate_campaign
 from ema_pipeline.stages.results import load_results
-from ema_pipeline.store import LOCK_FILE
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 

@@ -21,8 +21,9 @@ from numpy.testing import assert_array_equal
 from ema_pipeline import codec
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
+from ema_pipeline.results_folder import LOCK_FILE
 from ema_pipeline.run.opening import load_info
-from ema_pipeline.store import ALL, LOCK_FILE, Store, _holder
+from ema_pipeline.store import ALL, Store, _holder
 
 
 @dataclass(frozen=True)

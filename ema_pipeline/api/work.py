@@ -23,10 +23,11 @@ from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.files import link_or_copy
 from ema_pipeline.kinds import kind_of
 from ema_pipeline.pipeline import run_stages
+from ema_pipeline.results_folder import PARTS_FOLDER
 from ema_pipeline.run.opening import new_run, stored_settings, with_effect_files
 from ema_pipeline.run.settings import override
 from ema_pipeline.run.types import Run, RunInfo
-from ema_pipeline.store import PARTS_FOLDER, Store
+from ema_pipeline.store import Store
 from ema_pipeline.threads import single_blas_thread
 
 if TYPE_CHECKING:

@@ -20,10 +20,10 @@ from ema_pipeline.kinds import kind_of
 from ema_pipeline.observations.pair import RepeatSettings
 from ema_pipeline.pipeline import ShowStage
 from ema_pipeline.report.summary_files import finite
+from ema_pipeline.results_folder import RESULTS_FILE
 from ema_pipeline.run.measured import measured_modes
 from ema_pipeline.run.opening import existing_run
 from ema_pipeline.run.types import Run
-from ema_pipeline.store import RESULTS_FILE
 
 MEASURING = 'stages=["ingest", "hits", "frf", "modal", "levels"]'
 """Stages that are run where a test is given as a raw folder: its modes, and no diagnosis of its own."""

@@ -264,7 +264,7 @@ def view(
 def _is_raw(folder: Path) -> bool:
     """True for a folder with a test description and without results."""
     from ema_pipeline.ingest.description import DESCRIPTION_FILE
-    from ema_pipeline.store import RESULTS_FILE
+    from ema_pipeline.results_folder import RESULTS_FILE
 
     return (folder / DESCRIPTION_FILE).is_file() and not (folder / RESULTS_FILE).exists()
 

@@ -21,7 +21,7 @@ from ema_pipeline.ingest.readers import read_raw, reader_of
 from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord
 from ema_pipeline.ingest.swap import is_pulse
 from ema_pipeline.plain_text import printable
-from ema_pipeline.store import RESULTS_FILE
+from ema_pipeline.results_folder import RESULTS_FILE
 from ema_pipeline.units import SI_SYMBOL, Unit, find_unit
 
 _HAMMER_NAME = re.compile(r"hammer|hmr|impact|impuls|force|kraft|(^|[^a-z])ham([^a-z]|$)", re.IGNORECASE)

@@ -10,44 +10,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 
-from ema_pipeline.check_result import CheckResult, Consequence, judged
+from ema_pipeline.check_result import CheckResult, judged
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.clipping import flat_top_share, stands_at_top
+from ema_pipeline.ingest.channel_checks import (
+    SURE_FLAT_TOP,
+    check_response,
+    flat_top,
+    lost_samples,
+    overload,
+)
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.hits import align_hits, find_hits, trim_hits
-from ema_pipeline.ingest.lost_samples import SHORTEST, lost_stretch
 from ema_pipeline.ingest.pulse import Pulse, find_pulse, find_second_impact, noise_of, step_of
-from ema_pipeline.ingest.records import Hit, Record, ResponseChannel
+from ema_pipeline.ingest.records import Hit, Record
 from ema_pipeline.threads import in_order
 
 DOUBLE_HIT = "ISO 7626-5, avoidance of double impacts"
-OVERLOAD = "ISO 7626-5, overload of the measuring channels"
 SPECTRUM = "ISO 7626-5, frequency range of the impact force"
-DECAY = "ISO 7626-5, record length and decay of the response"
-
-FLAT_TOP_LIMIT = 0.7
-"""Smooth peaks have 0.5: the time within ε of the top grows with √ε."""
-
-SURE_FLAT_TOP = 0.85
-"""Flatter tops are clipped whatever else is known; 1 in 1600 channels of weak signals lies between the two limits."""
-
-FAR_BELOW_SCALE = 0.25
-"""No input clips below this share of its full scale: a sensor's own supply ends at half the usual input range. What is
-flat there all the same was clipped before the input, or the full scale is not the one stated."""
-
-BEYOND_SCALE = 1.1
-"""No input reads more than this share of its full scale, with what some leave above it: it is not the one stated."""
 
 EXCEEDED = 2.0
 """A level that the same channel exceeds this many times in another hit is not where it clips."""
+
+HAMMER_PEAKS_N = (0.2, 40e3)
+"""Peaks that impact hammers make: the smallest (1 g, for turbine blades) tap with about 1 N, sledges end at 22 kN."""
 
 _NO_BLOW = 10.0
 """Second impact over the first beyond which there was no first one."""
 
 BAND_OVER_RATE = 1 / 2.56
 """Converters' anti-alias filters are flat up to the sample rate over 2.56."""
-
-HUM_HZ = (50.0, 60.0)
 
 
 def hits_of_test(records: Sequence[Record], settings: HitSettings | None = None) -> tuple[Hit, ...]:
@@ -183,20 +174,20 @@ def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> 
     verdicts = [
         *hit.verdicts,
         _double_hit(force, pulse, rate, settings),
-        _overload(force, record.force_full_scale, name, "reject_hit", pulse.peak, rate, settings),
-        _flat_top(force, record.force_full_scale, name, "reject_hit", noise),
+        overload(force, record.force_full_scale, name, "reject_hit", pulse.peak, rate, settings),
+        flat_top(force, record.force_full_scale, name, "reject_hit", noise),
         _force_level(pulse, noise, name, settings),
         _force_spectrum(force, pulse, rate, name, settings),
     ]
     if record.force_calibrated:
         verdicts.append(_force_peak(hit.peak_force, name))
-    verdicts += _lost(force, step_of(force), name, "reject_hit", pulse.peak, rate)
+    verdicts += lost_samples(force, step_of(force), name, "reject_hit", pulse.peak, rate)
     # Before the first hit of a record the structure is at rest: what is there is noise and hum.
     rest = pulse.start if hit.start == 0 and hit.number == 1 else 0
 
     def check(row: int) -> tuple[list[CheckResult], bytes]:
         samples = record.responses[row, hit.start : hit.stop]
-        found = _check_response(record.channels[row], samples, pulse, rest, rate, settings)
+        found = check_response(record.channels[row], samples, pulse, rest, rate, settings)
         return found, _digest(samples)
 
     seen: dict[bytes, str] = {}
@@ -250,61 +241,6 @@ def _double_hit(force: NDArray[np.float64], pulse: Pulse, rate: float, settings:
     return judged("double hit", second.ratio, settings.double_hit, passes, DOUBLE_HIT, "reject_hit", fault)
 
 
-def _overload(
-    samples: NDArray[np.float64],
-    full_scale: float,
-    name: str,
-    consequence: Consequence,
-    peak: int,
-    rate: float,
-    settings: HitSettings,
-) -> CheckResult:
-    largest = float(max(samples.max(), -samples.min()))
-    share = largest / full_scale if np.isfinite(full_scale) else 0.0
-    passes = share < settings.overload
-    at = int(np.argmax(np.abs(samples)))
-    fault = f"overload on {name}: {share:.1%} of full scale {(at - peak) / rate:+.4g} s from the blow"
-    if share > BEYOND_SCALE:
-        fault = f"{name} reaches {share:.0%} of its full scale, which no input can: correct it in test.toml"
-    return judged("overload", share, settings.overload, passes, OVERLOAD, consequence, fault, channel=name)
-
-
-def _flat_top(
-    samples: NDArray[np.float64], full_scale: float, name: str, consequence: Consequence, noise: float
-) -> CheckResult:
-    share = flat_top_share(samples, noise)
-    used = float(max(samples.max(), -samples.min())) / full_scale
-    far_below = 0 < used < FAR_BELOW_SCALE
-    if far_below and FLAT_TOP_LIMIT <= share < SURE_FLAT_TOP:
-        share = 0.0  # undecided: nothing clips there
-    passes = share < FLAT_TOP_LIMIT
-    fault = f"{name} is clipped: its tops are flat; use a lower gain or hit softer"
-    if far_below:
-        fault = (
-            f"{name} is clipped at {used:.2%} of its full scale: its tops are flat; look for a saturated amplifier, or "
-            "correct the full scale in test.toml"
-        )
-        consequence = consequence if stands_at_top(samples) else "warn"
-    return judged("clipping", share, FLAT_TOP_LIMIT, passes, OVERLOAD, consequence, fault, channel=name)
-
-
-def _lost(
-    samples: NDArray[np.float64], step: float, name: str, consequence: Consequence, peak: int, rate: float
-) -> list[CheckResult]:
-    """A verdict only where samples were lost."""
-    start, stop = lost_stretch(samples, step)
-    if start == stop:
-        return []
-    fault = (
-        f"{name} stands at {samples[start]:.4g} for {stop - start} samples, {(start - peak) / rate:+.4g} to "
-        f"{(stop - peak) / rate:+.4g} s from the blow, amid a signal: samples were lost; export or record again"
-    )
-    verdict = judged(
-        "lost samples", stop - start, SHORTEST, False, "", consequence, fault, channel=name, unit="samples"
-    )
-    return [verdict]
-
-
 def _force_level(pulse: Pulse, noise: float, name: str, settings: HitSettings) -> CheckResult:
     ratio = min(pulse.height / noise, 1e12) if noise > 0 else 1e12
     passes = ratio >= settings.trigger_noise
@@ -334,120 +270,3 @@ def _force_spectrum(
     fault = f"force within {drop}; {top_db:.0f} dB at {wanted:.4g} Hz"
     passes = band >= wanted
     return judged("force spectrum", band, wanted, passes, SPECTRUM, "warn", fault, channel=name, unit="Hz")
-
-
-def _check_response(
-    channel: ResponseChannel,
-    samples: NDArray[np.float64],
-    pulse: Pulse,
-    rest: int,
-    rate: float,
-    settings: HitSettings,
-) -> list[CheckResult]:
-    step = step_of(samples)
-    dead = _dead_channel(channel.name, samples, step, pulse, rest, rate)
-    if not dead.passes:
-        return [dead]
-    noise = noise_of(samples, step)
-    return [
-        dead,
-        *_lost(samples, step, channel.name, "reject_channel", pulse.peak, rate),
-        _overload(samples, channel.full_scale, channel.name, "reject_channel", pulse.peak, rate, settings),
-        _flat_top(samples, channel.full_scale, channel.name, "reject_channel", noise),
-        _decay(channel.name, samples, pulse, rest, noise, settings),
-    ]
-
-
-def _dead_channel(
-    name: str, samples: NDArray[np.float64], step: float, pulse: Pulse, rest: int, rate: float
-) -> CheckResult:
-    """A channel that carries a constant, a flickering last bit, or nothing but mains hum.
-
-    A working sensor at a node shows its own broadband noise instead, many steps of the converter high; it is
-    not dead, however silent. The value is the number of converter steps that the channel spans, which
-    for a dead one is at most one.
-    """
-    spans = float(np.ptp(samples) / step) if step > 0 else 0.0
-    silent = spans > 1.5 and not _answers(samples, pulse, rest)
-    hum = _hum_share(samples, rate) if silent else 0.0
-    only_hum = hum > HUM_ONLY
-    passes = spans > 1.5 and not only_hum
-    if only_hum:
-        fault = (
-            f"{name} carries mains hum only ({hum:.1%} of its power) and no response to the blow: open cable?"
-        )
-    elif spans == 0:
-        fault = f"{name} is constant at {samples[0]:.3g}: sensor or cable dead"
-    else:
-        fault = f"{name} flickers by one converter step only: sensor or cable dead"
-    value = 0.0 if only_hum else min(spans, 1e12)
-    return judged("dead channel", value, 1.5, passes, "", "reject_channel", fault, channel=name, unit="steps")
-
-
-HAMMER_PEAKS_N = (0.2, 40e3)
-"""Peaks that impact hammers make: the smallest (1 g, for turbine blades) tap with about 1 N, sledges end at 22 kN."""
-
-HUM_ONLY = 0.98
-"""Share of a channel's power in mains lines from which on it carries nothing else."""
-
-
-def _hum_share(samples: NDArray[np.float64], rate: float) -> float:
-    """Share of the power, offset taken off, in 50 or 60 Hz and harmonics: a least-squares fit of sines.
-
-    A fit does not leak, whatever the record's length; the mains' own drift of ±0.1 Hz is searched.
-    """
-    centred = samples - samples.mean()
-    total = float(centred @ centred)
-    if total <= 0:
-        return 0.0
-    # The first second shows it as well as all of it and bears the mains' drift better.
-    n = min(centred.size, int(rate))
-    part, time = centred[:n], np.arange(n) / rate
-    power = float(part @ part)
-    best = 0.0
-    for mains in HUM_HZ:
-        # Fewer than two periods, or no room below Nyquist: not to be told from vibration.
-        if n < 2 * rate / mains or mains > 0.45 * rate or power <= 0:
-            continue
-        for frequency in mains + np.array([-0.1, 0.0, 0.1]):
-            harmonics = frequency * np.arange(1, 8)
-            phase = 2 * np.pi * np.outer(time, harmonics[harmonics < 0.45 * rate])
-            basis = np.hstack([np.ones((n, 1)), np.cos(phase), np.sin(phase)])
-            weights, *_ = np.linalg.lstsq(basis, part, rcond=None)
-            rest = part - basis @ weights
-            best = max(best, 1 - float(rest @ rest) / power)
-            if best < 0.5:
-                break
-    return best
-
-
-def _answers(samples: NDArray[np.float64], pulse: Pulse, rest: int) -> bool:
-    """True where the channel swings more after the blow than before it, or than late in the record."""
-    span = min(max(int(16 * pulse.width), 64), samples.size // 4)
-    after = samples[pulse.start : pulse.start + span]
-    quiet = samples[:rest] if rest >= span else samples[-span:]
-    return bool(np.std(after) > 1.5 * np.std(quiet))
-
-
-def _decay(
-    name: str, samples: NDArray[np.float64], pulse: Pulse, rest: int, noise: float, settings: HitSettings
-) -> CheckResult:
-    """Response at the end of the record over its largest, noise and hum taken off.
-
-    Both are rms over a twentieth of the record. What the channel shows before the blow (or, in the middle
-    of a recording, its broadband noise) is no response. A channel that shows nothing but noise has decayed.
-    """
-    length = max(samples.size // 20, 8)
-    quiet = float(np.std(samples[:rest])) if rest >= 32 else noise
-    blocks = samples[samples.size % length :].reshape(-1, length)
-    blocks = blocks[max(0, (pulse.start - samples.size % length) // length) :]
-    # Offset from the end: an AC-coupled or drifting channel is centred where it matters.
-    rms = np.sqrt(np.mean((blocks - np.mean(blocks[-1])) ** 2, axis=1))
-    largest = float(rms.max())
-    left = float(np.sqrt(max(rms[-1] ** 2 - quiet**2, 0.0)))
-    # Scatter of an rms over n samples is rms/√(2n): less than three times that is no response.
-    silent = left < quiet * np.sqrt(3 / np.sqrt(2 * length)) * 1.5 or largest < 3 * quiet
-    ratio = 0.0 if silent or largest == 0 else left / largest
-    limit = settings.residual_response
-    fault = f"{name} still at {ratio:.1%} of its largest at the end: record longer"
-    return judged("response decay", ratio, limit, ratio <= limit, DECAY, "warn", fault, channel=name)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.fft import rfft
 
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.ingest.hit_checks import HUM_HZ
+from ema_pipeline.ingest.channel_checks import HUM_HZ
 from ema_pipeline.ingest.pulse import find_pulse
 from ema_pipeline.ingest.records import HitSamples
 from ema_pipeline.lazy_samples import LazySamples

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.fft import rfft
 
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.ingest.hit_checks import HUM_HZ
+from ema_pipeline.ingest.channel_checks import HUM_HZ
 from ema_pipeline.modal.basis import pole_values
 from ema_pipeline.modal.drift.windows import Hits
 from ema_pipeline.modal.left_out import taken_out_and_named

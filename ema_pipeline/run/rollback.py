@@ -14,9 +14,10 @@ from collections.abc import Callable, Iterator
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import cannot_write
+from ema_pipeline.results_folder import BEFORE, bring_back_files, keep_files
 from ema_pipeline.run.opening import load_info, save_info
 from ema_pipeline.run.types import RunInfo
-from ema_pipeline.store import BEFORE, Store, bring_back_files, keep_files
+from ema_pipeline.store import Store
 
 
 @dataclasses.dataclass

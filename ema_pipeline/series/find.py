@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.description import DESCRIPTION_FILE
-from ema_pipeline.store import RESULTS_FILE
+from ema_pipeline.results_folder import RESULTS_FILE
 from ema_pipeline.toml_text import read_toml
 
 

@@ -17,13 +17,14 @@ from ema_pipeline.files import file_hash
 from ema_pipeline.ingest.description import DESCRIPTION_FILE
 from ema_pipeline.keys import code_fingerprint
 from ema_pipeline.processes import peak_memory_mb
+from ema_pipeline.results_folder import RESULTS_FILE
 from ema_pipeline.run.settings import load_pipeline
 from ema_pipeline.series.database import SeriesDatabase
 from ema_pipeline.series.engine import Work, in_processes, on_cluster
 from ema_pipeline.series.find import FoundTest, find_tests, raw_fingerprint
 from ema_pipeline.series.one_test import Task, run_task
 from ema_pipeline.series.rows import TestRow
-from ema_pipeline.store import RESULTS_FILE, Store
+from ema_pipeline.store import Store
 
 TESTS_FOLDER = "tests"
 """Folder of a series that holds the results folders."""

@@ -28,7 +28,7 @@ from ema_pipeline.run.measured import level_study, modes_key
 from ema_pipeline.run.models import diagnosed_choices, diagnosis_is_of_other_data
 from ema_pipeline.run.records import count_driven
 from ema_pipeline.run.types import Run
-from ema_pipeline.store import ALL, PARTS_FOLDER
+from ema_pipeline.store import ALL
 
 
 def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
@@ -99,7 +99,7 @@ def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
         diagnosed_choices=diagnosed_choices(run),
         folder=str(run.store.folder),
         missing_files=tuple(
-            f"{PARTS_FOLDER}/{part.name}" for part in run.store.parts() if not part.is_file()
+            part.relative_to(run.store.folder).as_posix() for part in run.store.parts() if not part.is_file()
         ),
         effect_files=tuple(map(_typed, filter(run.named_files.__contains__, run.settings.effect_files))),
         provenance=provenance(run),

@@ -12,7 +12,8 @@ from pathlib import Path
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import link_or_copy
-from ema_pipeline.store import PARTS_FOLDER, RESULTS_FILE, Store, bring_back_files, keep_files
+from ema_pipeline.results_folder import PARTS_FOLDER, RESULTS_FILE, bring_back_files, keep_files
+from ema_pipeline.store import Store
 
 FOLDER = ".view-"
 """Begins the name of a server's folder of snapshots; its process number follows."""

@@ -19,11 +19,12 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.files import replace_file
 from ema_pipeline.job import adding, change_effects, changed_effects, run_on, run_raw
 from ema_pipeline.pipeline import run_stages
+from ema_pipeline.results_folder import LOCK_FILE
 from ema_pipeline.run.opening import existing_run, load_info, save_info
 from ema_pipeline.run.types import Progress, Run
 from ema_pipeline.stages import fit
 from ema_pipeline.stages.results import load_results
-from ema_pipeline.store import ALL, LOCK_FILE, Store
+from ema_pipeline.store import ALL, Store
 
 EFFECT = """
 from pathlib import Path
