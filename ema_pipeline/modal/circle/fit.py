@@ -25,11 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.modal.circle.fit_kernel import fit_sweep
 from ema_pipeline.modal.circle.geometry import geometric_circle
 
 MINIMUM_POINTS = 5  # six real unknowns against two real numbers per line, and some to judge the fit by
-_STEPS = 40
-_SMALLEST_DAMPING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -185,41 +184,12 @@ def _fit_sweep(
     weights: NDArray[np.float64],
     start: tuple[float, float],
 ) -> tuple[float, float, float]:
-    """Least squares of the angles on θ = phase - 2 arctan x; Levenberg-Marquardt in (ln f_n, ln ζ, phase)."""
-
-    def misfit(p: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-        x = sweep(f, float(np.exp(p[0])), float(np.exp(p[1])))
-        # 2 arctan x as a phase factor: angles never need unwrapping
-        error = np.angle(unit * (1 + 1j * x) / (1 - 1j * x) * np.exp(-1j * p[2]))
-        return x, error, float(np.sum(weights * error**2))
-
+    """Natural frequency (Hz), damping ratio and phase at resonance by least squares of the angles."""
     x = sweep(f, *start)
-    phase = np.angle(np.sum(weights * unit * (1 + 1j * x) / (1 - 1j * x)))
-    p = np.array([np.log(start[0]), np.log(start[1]), phase])
-    bounds = np.log([f[0], f[-1]])
-    damping = 1e-4
-    x, error, cost = misfit(p)
-    for _ in range(_STEPS):
-        ratio = f / np.exp(p[0])
-        bend = 2 / (1 + x**2)
-        by_frequency = -bend * (ratio + 1 / ratio) / (2 * np.exp(p[1]))
-        jacobian = np.stack([-by_frequency, bend * x, np.ones_like(f)], axis=1)
-        normal = (jacobian * weights[:, None]).T @ jacobian
-        gradient = (jacobian * weights[:, None]).T @ error
-        # scaled by the diagonal (Marquardt): frequency is far better determined than the rest
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
-        trial = p + step
-        trial[0] = np.clip(trial[0], *bounds)
-        trial[1] = np.clip(trial[1], np.log(_SMALLEST_DAMPING), 0.0)
-        x_trial, error_trial, cost_trial = misfit(trial)
-        done = np.max(np.abs(trial - p)) < 1e-9
-        if cost_trial <= cost:
-            p, x, error, cost, damping = trial, x_trial, error_trial, cost_trial, damping * 0.1
-        else:
-            damping *= 10
-        if done:
-            break
-    return float(np.exp(p[0])), float(np.exp(p[1])), float(p[2])
+    phase = float(np.angle(np.sum(weights * unit * (1 + 1j * x) / (1 - 1j * x))))
+    found = np.array([np.log(start[0]), np.log(start[1]), phase])
+    fit_sweep(np.ascontiguousarray(f), np.ascontiguousarray(unit), np.ascontiguousarray(weights), found)
+    return float(np.exp(found[0])), float(np.exp(found[1])), float(found[2])
 
 
 def _pair_damping(

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-_STEPS = 30
+from ema_pipeline.modal.circle.fit_kernel import best_centre
 
 
 def algebraic_circle(points: NDArray[np.complex128], weights: NDArray[np.float64]) -> tuple[complex, float]:
@@ -55,31 +55,6 @@ def geometric_circle(points: NDArray[np.complex128], weights: NDArray[np.float64
     centre, radius = algebraic_circle(points, weights)
     if not np.isfinite(radius) or radius == 0.0:
         return centre, radius
-    damping = 1e-4
-    cost = _cost(points, weights, centre)
-    for _ in range(_STEPS):
-        off = points - centre
-        distance = np.maximum(np.abs(off), 1e-12 * radius)
-        unit = off / distance
-        # with the best radius for each centre, only the centre is left to find
-        slope = unit - np.sum(weights * unit)
-        error = distance - np.sum(weights * distance)
-        jacobian = np.stack([slope.real, slope.imag], axis=1)
-        normal = (jacobian * weights[:, None]).T @ jacobian
-        gradient = (jacobian * weights[:, None]).T @ error
-        step = np.linalg.solve(normal + damping * np.eye(2) * np.trace(normal), gradient)
-        trial = centre + complex(step[0], step[1])
-        trial_cost = _cost(points, weights, trial)
-        done = abs(trial - centre) < 1e-10 * radius
-        if trial_cost <= cost:
-            centre, cost, damping = trial, trial_cost, damping * 0.1
-        else:
-            damping *= 10
-        if done:
-            break
+    flat = np.ascontiguousarray(points, np.complex128), np.ascontiguousarray(weights, np.float64)
+    centre = complex(best_centre(*flat, centre, radius))
     return centre, float(np.sum(weights * np.abs(points - centre)))
-
-
-def _cost(points: NDArray[np.complex128], weights: NDArray[np.float64], centre: complex) -> float:
-    distance = np.abs(points - centre)
-    return float(np.sum(weights * (distance - np.sum(weights * distance)) ** 2))
