@@ -202,6 +202,25 @@ def test_what_modes_are_to_each_other_stays_when_one_of_them_is_held_out() -> No
     assert not np.any(listed.only(np.array([True, False, True])).may_hide_another)
 
 
+def test_shapes_of_poles_that_nearly_coincide_may_hold_far_more_of_each_other() -> None:
+    """Frequencies a quarter of a half-width and a whole one apart; and a quarter, but with half of the damping."""
+
+    def share(apart: float, damping: float) -> float:
+        f, zeta = np.array([100.0, 100.0 + apart]), np.array([0.01, damping])
+        shapes = np.array([[1.0, 0, 0.5, 0.2], [0, 1.0, -0.5, 0.4]], complex)
+        measured = MeasuredModes(
+            "all", f, 1e-3 * f, zeta, np.full(2, 1e-4), shapes, np.full((2, 4), 1e-3),
+            tuple(Dof.parse(f"m{k}.x") for k in range(4)),
+        )  # fmt: skip
+        (_, _, one), (_, _, other) = prepare(measured).mixes
+        assert one == other
+        return one
+
+    assert share(0.25, 0.01) > 10 * share(1.0, 0.01)
+    # unlike damping tells the poles apart, and true shapes may be mixed by it
+    assert share(0.25, 0.0099) > 3 * share(0.25, 0.005)
+
+
 def test_shapes_that_hold_some_of_each_other_are_told_from_a_model_that_is_wrong() -> None:
     """A share of 8 % that identification mixed in is found, and no part bends to it."""
     rig = planetary()

@@ -98,7 +98,8 @@ def fit_sweep(f: Real, unit: Complex, weights: Real, p: Real) -> None:
                 gradient[i] += weights[k] * by[i] * error[k]
                 for j in range(i + 1):
                     normal[i, j] += weights[k] * by[i] * by[j]
-        for i in range(3):  # scaled by the diagonal (Marquardt): frequency is far better determined than the rest
+        for i in range(3):
+            # scaled by the diagonal (Marquardt): frequency is far better determined than the rest
             normal[i, i] *= 1 + damping
         if not _solved(normal, gradient, step):
             break
