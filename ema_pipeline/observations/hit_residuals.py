@@ -52,7 +52,7 @@ _REMEMBERED = 16
 def hit_scatters() -> dict[str, Scatter]:
     """The hyper-parameters that single hits add to those of measured modes."""
     known = (
-        Scatter(DRIFT, "ln f of all modes from hit to hit", 1e-4, 1.0, 1e-4, 20.0),
+        Scatter(DRIFT, "ln f of all modes from hit to hit", 1e-4, 1.0, 1e-3, 20.0),
         Scatter(HIT_FREQUENCY, "ln f of one mode from hit to hit", 3e-5, 1.0, 3e-5, 5.0),
         Scatter(HIT_DAMPING, "ln ζ of one mode from hit to hit", 5e-3, 1.0, 5e-3, 15.0),
         Scatter(HIT_QUADRATURE, "imaginary part of one mode's size from hit to hit", 3e-3, 1.0, 1e-2, 15.0),
