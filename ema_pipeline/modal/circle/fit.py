@@ -188,7 +188,7 @@ def _fit_sweep(
     x = sweep(f, *start)
     phase = float(np.angle(np.sum(weights * unit * (1 + 1j * x) / (1 - 1j * x))))
     found = np.array([np.log(start[0]), np.log(start[1]), phase])
-    fit_sweep(np.ascontiguousarray(f), np.ascontiguousarray(unit), np.ascontiguousarray(weights), found)
+    fit_sweep(np.ascontiguousarray(f), unit, weights, found)
     return float(np.exp(found[0])), float(np.exp(found[1])), float(found[2])
 
 

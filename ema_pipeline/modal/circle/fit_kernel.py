@@ -144,7 +144,8 @@ def best_centre(points: Complex, weights: Real, centre: complex, radius: float) 
     centre, radius
         Where to begin.
     """
-    error, gradient, step, normal = np.empty(points.size), np.empty(2), np.empty(2), np.empty((2, 2))
+    error, error_trial = np.empty(points.size), np.empty(points.size)
+    gradient, step, normal = np.empty(2), np.empty(2), np.empty((2, 2))
     unit = np.empty(points.size, dtype=np.complex128)
     damping, cost = 1e-4, _distances(points, weights, centre, error)
     for _ in range(_CIRCLE_STEPS):
@@ -168,13 +169,13 @@ def best_centre(points: Complex, weights: Real, centre: complex, radius: float) 
         if not _solved(normal, gradient, step):
             break
         trial = centre + complex(step[0], step[1])
-        cost_trial = _distances(points, weights, trial, error)
+        cost_trial = _distances(points, weights, trial, error_trial)
         done = hypot(step[0], step[1]) < _CIRCLE_ENOUGH * radius
         if cost_trial <= cost:
             centre, cost, damping = trial, cost_trial, damping * 0.1
+            error, error_trial = error_trial, error
         else:
             damping *= 10
-            _distances(points, weights, centre, error)
         if done:
             break
     return centre
