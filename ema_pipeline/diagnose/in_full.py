@@ -8,14 +8,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ema_pipeline.diagnose.selection import Selection
-from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, refined
-from ema_pipeline.processes import spread
+from ema_pipeline.observations.fitting import Fit, best_refined, refined
 
 _BEHIND = 10.0
 """Log evidence by which the calculation in full may be behind: scatters were learned without it, and from one force to
@@ -41,8 +36,5 @@ def fit_in_full(observations: Observations, fit: Fit, processes: int | None = 1)
     before = refined(linearised, model, posterior.x, posterior.scatters)
     starts = model.problem(full).sized_anew(posterior.x)
 
-    def job(x: NDArray[np.float64]) -> Posterior:
-        return refined(full, model, x, posterior.scatters).posterior
-
-    final = Fit(model, max(spread(job, starts, processes), key=lambda one: one.log_evidence))
+    final = best_refined(full, model, starts, posterior.scatters, processes)
     return (full, final) if final.log_evidence > before.log_evidence - _BEHIND else (observations, fit)

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect, effect_of
 from ema_pipeline.inference import Apart, Posterior, Residuals, Unknowns, joined
+from ema_pipeline.mechanics.laws import Nonlinear
 from ema_pipeline.observations.amplitude_starts import begun, sized_anew
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.hit_data import HitData, comparable
-from ema_pipeline.observations.hit_lattice import LEAST, MarchedHits, on_lattice
-from ema_pipeline.observations.hit_march import rubs, steps_to_end
+from ema_pipeline.observations.hit_lattice import LEAST, SizeLattice, uninterpolated
+from ema_pipeline.observations.hit_march import parts, rubs, steps_to_end
 from ema_pipeline.observations.hit_residuals import (
     AMPLITUDE,
     DRIFT,
@@ -70,8 +71,9 @@ class AmplitudeObservations(Observations):
         Of the configurations that were struck at several levels.
     of_modes : bool
         True where the hits tell only how far the modes of their level lie from those of the linear structure.
-    marched : MarchedHits, optional
-        Of the fit whose structure stands for all where hits are marched; each structure its own where left out.
+    lattice : SizeLattice, optional
+        About the fit whose structure stands for all with friction, and where hits are marched; each structure its own
+        where left out.
     rubbing : dict of str to set of str
         Effects whose hits are marched as those of teeth are, and the names of their elements, by label.
     cut_off : bool
@@ -86,13 +88,13 @@ class AmplitudeObservations(Observations):
         modes: ModeObservations,
         hits: Sequence[HitData],
         of_modes: bool = False,
-        marched: MarchedHits | None = None,
+        lattice: SizeLattice | None = None,
         rubbing: Mapping[str, frozenset[str]] | None = None,
         cut_off: bool = False,
     ) -> None:
         # what depends on the amplitude lets shapes lag as well, and hits tell of it by their sizes in quadrature
         self.modes = modes = modes.without_lag()
-        self.hits, self.of_modes, self.marched = tuple(hits), of_modes, marched
+        self.hits, self.of_modes, self.lattice = tuple(hits), of_modes, lattice
         self.rubbing, self.cut_off = dict(rubbing or {}), cut_off
         self.level_dependent = any(
             h.level_dependent and not modes.rig.assembly(h.configuration).nonlinear for h in hits
@@ -107,7 +109,7 @@ class AmplitudeObservations(Observations):
         return tuple(HitRows(h, defaults, self.cut_off) for h in self.hits)
 
     def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> AmplitudeObservations:
-        """See `Observations`: hits are marched about the structure of this fit."""
+        """See `Observations`: what friction changes, and marched hits, are found about the structure of this fit."""
         return self._about(effects, found, self.rubbing)
 
     def in_full(
@@ -120,8 +122,7 @@ class AmplitudeObservations(Observations):
         """
         if any(h.pulses is None for h in self.hits) or sum(map(steps_to_end, self.hits)) > _MOST_STEPS:
             return None
-        rubbing = {e.label: self._friction_of(e) for e in effects if not e.effect.linear}
-        rubbing = {label: names for label, names in rubbing.items() if names}
+        rubbing = {e.label: names for e in effects if (names := self.friction_of(e))}
         if rubbing.keys() <= self.rubbing.keys():
             return None
         of = {h.configuration: h for h in self.hits}
@@ -131,8 +132,10 @@ class AmplitudeObservations(Observations):
         known = AmplitudeObservations(modes, self.hits, self.of_modes, cut_off=True)
         return known._about(effects, found, rubbing), known._about(effects, found, self.rubbing)
 
-    def _friction_of(self, effect: PlacedEffect) -> frozenset[str]:
+    def friction_of(self, effect: PlacedEffect) -> frozenset[str]:
         """Names of the elements that an effect adds, where all of them that depend on the amplitude are friction."""
+        if effect.effect.linear:
+            return frozenset()
         rig = self.modes.rig
         added = [e for name in rig.configurations for e in effect.nonlinear_of(rig.assembly(name))]
         return frozenset(e.name for e in added) if all(rubs(e) for e in added) else frozenset()
@@ -143,18 +146,18 @@ class AmplitudeObservations(Observations):
         plain = AmplitudeObservations(
             self.modes, self.hits, self.of_modes, rubbing=rubbing, cut_off=self.cut_off
         )
-        return plain._of(self.modes, self.hits, self.of_modes, MarchedHits(plain, effects, found))
+        return plain._of(self.modes, self.hits, self.of_modes, SizeLattice(plain, effects, found))
 
     def _of(
         self,
         modes: ModeObservations,
         hits: Sequence[HitData],
         of_modes: bool = False,
-        marched: MarchedHits | None = None,
+        lattice: SizeLattice | None = None,
     ) -> AmplitudeObservations:
         """Some of the data, known in the same way."""
         return AmplitudeObservations(
-            modes, hits, of_modes, marched or self.marched, self.rubbing, self.cut_off
+            modes, hits, of_modes, lattice or self.lattice, self.rubbing, self.cut_off
         )
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> AmplitudeProblem:
@@ -309,22 +312,50 @@ class AmplitudeProblem(EffectProblem):
         marched = lengths | self.observations.rubbing.keys()
         return tuple(self.unknowns.index[n] for n in self.sizes if effect_of(n) in marched)
 
+    @cached_property
+    def _friction(self) -> Mapping[str, frozenset[str]]:
+        """Names of the elements of every effect that is all friction, by label."""
+        found = {e.label: self.observations.friction_of(e) for e in self.effects}
+        return {label: names for label, names in found.items() if names}
+
+    @cached_property
+    def lattice_sizes(self) -> tuple[int, ...]:
+        """Positions of the sizes of effects that are found on the lattice about one fit: marched ones and friction."""
+        rubbing = [i for i in self.nonlinear_sizes if self.rubs(self.unknowns.names[i])]
+        return tuple(sorted({*self.marched_sizes, *rubbing}))
+
+    def rubs(self, name: str) -> bool:
+        """True for a size of an effect that is all friction."""
+        return effect_of(name) in self._friction
+
     def in_full(self, name: str) -> bool:
         """True for a size of an effect that is calculated in full, beside teeth."""
         return effect_of(name) in self.observations.rubbing
 
+    def is_marched(self, element: Nonlinear) -> bool:
+        """True for an element whose hits are marched."""
+        if not self.marched_sizes:
+            return False
+        return parts(element) or any(element.name in names for names in self.observations.rubbing.values())
+
+    def on_lattice(self, element: Nonlinear) -> bool:
+        """True for an element that is found on the lattice about one fit, where there is one."""
+        return self.is_marched(element) or any(element.name in names for names in self._friction.values())
+
     def step(self, i: int, x: NDArray[np.float64]) -> float:
         """Step of the difference by the unknown at position `i`; of what is marched finer ones show its own steps.
 
-        Of what is calculated in full it goes back, to where larger motions lead as well: into the same cell of the
-        lattice, in which force, rate and amplitude together change nothing.
+        Of friction on a lattice it goes back, to where larger motions lead as well: into the same cell, in which force,
+        rate and amplitude together change nothing.
         """
-        if i not in self.marched_sizes:
-            return _STEP
         name = self.unknowns.names[i]
-        if not self.in_full(name):
+        if i in self.marched_sizes and not self.rubs(name):
             return _MARCHED_STEP
-        return -_MARCHED_STEP * (1.0 if self.sizes[name].logarithmic else max(float(x[i]), LEAST))
+        if self.observations.lattice is None or not self.rubs(name):
+            return _STEP
+        if self.sizes[name].logarithmic:
+            return -_MARCHED_STEP
+        return -_MARCHED_STEP * float(x[i]) if x[i] > LEAST else _STEP
 
     def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> list[NDArray[np.float64]]:
         """See `EffectProblem`: nothing where the effect added last is linear."""
@@ -336,7 +367,7 @@ class AmplitudeProblem(EffectProblem):
 
     def uninterpolated(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `EffectProblem`: with the lengths of teeth on the lattice of marched hits."""
-        return on_lattice(self, x)
+        return uninterpolated(self, x)
 
     def residuals(
         self,

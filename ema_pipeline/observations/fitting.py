@@ -28,6 +28,7 @@ from ema_pipeline.inference.bounded import FURTHEST
 from ema_pipeline.inference.maximise import ANNEALING
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.parts import FREE_STD, MASS_SCATTER, PART_SCATTER
+from ema_pipeline.processes import spread
 from ema_pipeline.rigs.types import Rig
 
 PARTS = (PART_SCATTER, MASS_SCATTER)
@@ -43,7 +44,7 @@ REFINED = 12
 
 _RACED = 2
 """Starts that are annealed to the end."""
-_RACE_STEPS = 8
+_RACE_STEPS = 6
 """Steps from each of several good starts, after which the best goes on."""
 _MET = 0.05
 """Distance, in units of the prior 1 σ, up to which two fits have met."""
@@ -214,13 +215,17 @@ def best_refined(
     model: Model,
     starts: Sequence[NDArray[np.float64]],
     scatters: Mapping[str, float] | None = None,
+    processes: int | None = 1,
 ) -> Fit:
-    """A fit from the best of some starts, after some steps from each."""
+    """A fit from the best of some starts, after some steps from each, which processes share."""
     if len(starts) == 1:
         return refined(observations, model, starts[0], scatters)
-    short = [refined(observations, model, x, scatters, _RACE_STEPS) for x in starts]
-    best = max(short, key=lambda f: f.log_evidence)
-    return refined(observations, model, best.posterior.x, scatters)
+
+    def short(x: NDArray[np.float64]) -> Posterior:
+        return refined(observations, model, x, scatters, _RACE_STEPS).posterior
+
+    best = max(spread(short, starts, processes), key=lambda p: p.log_evidence)
+    return refined(observations, model, best.x, scatters)
 
 
 def freed(observations: Observations, fit: Fit) -> Fit:

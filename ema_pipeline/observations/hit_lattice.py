@@ -1,8 +1,8 @@
-"""Marched hits about one fit of the model: at sizes on a lattice, and straight in between.
+"""What teeth and friction change, about one fit of the model: at sizes on a lattice, and straight in between.
 
-Fits of a hundred hypotheses beside teeth that part ask for the same hits at thousands of points, at which the linear
-structure hardly differs: it is that of one fit for all. So every hit is marched once for each size that is asked for,
-and the answer depends on no order in which that happens.
+Fits of a hundred hypotheses beside teeth that part, or beside friction, ask for the same at thousands of points, at
+which the linear structure hardly differs: it is that of one fit for all. So every hit is marched, or friction
+linearised, once for each size that is asked for, and the answer depends on no order in which that happens.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ Complex = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 
 SPACING, _COARSE = 0.05, 0.2
-"""Of the lattice, in the unknowns of sizes, of which one is the prior σ; and of what is calculated in full, whose hits
-are marched to the end of their records."""
+"""Of the lattice, in the unknowns of sizes, of which one is the prior σ, of friction in their logarithm; and of what is
+calculated in full, whose hits are marched to the end of their records."""
 _ON = 1e-6
 LEAST = 1e-6
 """Size, in its prior σ, below which a size that cannot be negative is nothing."""
 
 
-class MarchedHits:
-    """What effects change of the modes in single hits whose hits are marched.
+class SizeLattice:
+    """What effects change of the modes in single hits where their sizes are on a lattice.
 
     Parameters
     ----------
@@ -53,8 +53,23 @@ class MarchedHits:
         self._nodes: dict[tuple[object, ...], Complex] = {}
 
     def changes(self, data: HitData, problem: AmplitudeProblem, x: NDArray[np.float64]) -> Complex:
-        """What effects change whose hits are marched, as `HitResiduals.moved` has it, of all or some hits."""
-        names, at = self._place(problem, x)
+        """What the effects on the lattice change, as `HitResiduals.moved` has it, of all or some hits.
+
+        Marched elements move each other; friction that is linearised is found by itself for every effect.
+        """
+        names = {i: problem.unknowns.names[i] for i in problem.lattice_sizes}
+        own = {i: effect_of(name) for i, name in names.items() if i not in problem.marched_sizes}
+        groups = [[i for i, of in own.items() if of == label] for label in dict.fromkeys(own.values())]
+        groups += [list(problem.marched_sizes)] if problem.marched_sizes else []
+        return sum(
+            (self._interpolated(data, problem, x, group) for group in groups), np.zeros((2, 1, 1), complex)
+        )
+
+    def _interpolated(
+        self, data: HitData, problem: AmplitudeProblem, x: NDArray[np.float64], sizes: Sequence[int]
+    ) -> Complex:
+        """What the effects of some sizes change, by the positions of these."""
+        names, at = self._place(problem, x, sizes)
         low = np.floor(at + _ON).astype(np.int64)
         first = self._node(data, problem, names, low)
         result = first.copy()
@@ -68,18 +83,20 @@ class MarchedHits:
         return result[:, [place[n] for n in data.names]]
 
     @staticmethod
-    def _place(problem: AmplitudeProblem, x: NDArray[np.float64]) -> tuple[list[str], NDArray[np.float64]]:
-        """Unknowns that span the lattice, and where `x` lies in it.
+    def _place(
+        problem: AmplitudeProblem, x: NDArray[np.float64], sizes: Sequence[int]
+    ) -> tuple[list[str], NDArray[np.float64]]:
+        """Names of some sizes, and where `x` lies in the lattice that they span.
 
         Larger motions are as smaller lengths, forces and rates.
         """
-        names = [problem.unknowns.names[i] for i in problem.marched_sizes]
-        at, scale = x[list(problem.marched_sizes)], x[problem.unknowns.index[AMPLITUDE]]
-        coarse = np.array([problem.in_full(n) for n in names])
+        names = [problem.unknowns.names[i] for i in sizes]
+        at, scale = x[list(sizes)], x[problem.unknowns.index[AMPLITUDE]]
+        rubs = np.array([problem.rubs(n) for n in names])
         logarithmic = np.array([problem.sizes[n].logarithmic for n in names])
-        at = np.where(coarse & ~logarithmic, np.log(np.maximum(at, LEAST)) / LOG_STD, at)
-        moved = np.where(logarithmic | coarse, at - scale / LOG_STD, at * np.exp(-scale))
-        return names, moved / np.where(coarse, _COARSE, SPACING)
+        at = np.where(rubs & ~logarithmic, np.log(np.maximum(at, LEAST)) / LOG_STD, at)
+        moved = np.where(logarithmic | rubs, at - scale / LOG_STD, at * np.exp(-scale))
+        return names, moved / np.array([_spacing(problem, n) for n in names])
 
     def _whole(self, data: HitData) -> HitData:
         return next(h for h in self._observations.hits if h.configuration == data.configuration)
@@ -92,10 +109,12 @@ class MarchedHits:
         if key not in self._nodes:
             if labels not in self._problems:
                 self._problems[labels] = self._observations.problem(effects, problem.scales)
-            self._nodes[key] = self._marched(self._whole(data), self._problems[labels], names, at)
+            self._nodes[key] = self._calculated(self._whole(data), self._problems[labels], names, at)
         return self._nodes[key]
 
-    def _marched(self, data: HitData, problem: AmplitudeProblem, names: list[str], at: Integers) -> Complex:
+    def _calculated(
+        self, data: HitData, problem: AmplitudeProblem, names: list[str], at: Integers
+    ) -> Complex:
         posterior, unknowns = self._found, problem.unknowns
         x = transferred(posterior, unknowns, problem.start())
         for name, place in zip(names, at.tolist(), strict=True):
@@ -105,24 +124,27 @@ class MarchedHits:
         paired = problem.modes.paired(data.reference, x[: len(problem.modes.unknowns)], None)
         if paired is None:
             return np.zeros((2, *data.log_frequency.shape), complex)
-        return HitResiduals(problem, data, paired, x, posterior.scatters, 1.0).moved(x)
+        here = HitResiduals(problem, data, paired, x, posterior.scatters, 1.0)
+        return here.calculated(x, problem.on_lattice)
 
 
-def on_lattice(problem: AmplitudeProblem, x: NDArray[np.float64]) -> NDArray[np.float64]:
+def uninterpolated(problem: AmplitudeProblem, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """`x` with the lengths of teeth at the nearest place of the lattice, where nothing is interpolated, (n,).
 
     Every length that lies between two places costs another march of all hits.
     """
-    lengths = [i for i in problem.marched_sizes if not problem.in_full(problem.unknowns.names[i])]
+    lengths = [i for i in problem.marched_sizes if not problem.rubs(problem.unknowns.names[i])]
     moved = x[problem.unknowns.index[AMPLITUDE]] / LOG_STD
     x = x.copy()
     x[lengths] = np.rint((x[lengths] - moved) / SPACING) * SPACING + moved
     return problem.unknowns.clipped(x)
 
 
+def _spacing(problem: AmplitudeProblem, name: str) -> float:
+    return _COARSE if problem.in_full(name) else SPACING
+
+
 def _unknown(problem: AmplitudeProblem, name: str, place: int) -> float:
     """The unknown of a size at a place of the lattice."""
-    if not problem.in_full(name):
-        return place * SPACING
-    at = place * _COARSE
-    return at if problem.sizes[name].logarithmic else float(np.exp(at * LOG_STD))
+    at = place * _spacing(problem, name)
+    return at if problem.sizes[name].logarithmic or not problem.rubs(name) else float(np.exp(at * LOG_STD))

@@ -7,7 +7,7 @@ modes at the measured amplitudes comes from `observations.hit_modes`.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import compress
 from typing import TYPE_CHECKING
@@ -22,7 +22,7 @@ from ema_pipeline.mechanics.laws import Nonlinear, Spring
 from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.observations.hit_aim import as_aimed
 from ema_pipeline.observations.hit_data import HitData
-from ema_pipeline.observations.hit_march import Driven, marched_modes, parts, rubs
+from ema_pipeline.observations.hit_march import Driven, marched_modes, rubs
 from ema_pipeline.observations.hit_modes import Linear, changed_modes
 from ema_pipeline.observations.hit_rows import (
     HIT_AIM,
@@ -204,9 +204,21 @@ class HitResiduals:
         return known[key]
 
     def _found_moved(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
+        lattice = self.problem.observations.lattice
+        if lattice is None:
+            return self.calculated(x, lambda element: True)
+        total = self.calculated(x, lambda element: not self.problem.on_lattice(element))
+        if any(map(self.problem.on_lattice, self._assembly(x).nonlinear)):
+            total += lattice.changes(self.data, self.problem, x)
+        return total
+
+    def calculated(
+        self, x: NDArray[np.float64], wanted: Callable[[Nonlinear], bool]
+    ) -> NDArray[np.complex128]:
+        """What some elements change, as `moved` has it, with the structure that these unknowns make."""
         data = self.data
         assembly = self._assembly(x)
-        elements = assembly.nonlinear
+        elements = [e for e in assembly.nonlinear if wanted(e)]
         total = np.zeros((2, *data.log_frequency.shape), complex)
         match = self.paired.match[data.modes]
         on = np.flatnonzero(match >= 0)
@@ -217,7 +229,7 @@ class HitResiduals:
         stretch = rows @ solution.shapes[: rows.shape[1]]
         displacement = self._displacement(x, match, on)
         scaled = [self._scaled(e, x) for e in elements]
-        of_marched = np.array([self._is_marched(e) for e in scaled])
+        of_marched = np.array([self.problem.is_marched(e) for e in scaled])
         if of_marched.any():
             through_time = list(compress(scaled, of_marched))
             marched = self._marched(x, through_time, stretch[of_marched], match, displacement)
@@ -229,14 +241,6 @@ class HitResiduals:
         linear = Linear.of(data, stretch, match, solution.eigenvalues, displacement)
         return total + changed_modes(data, scaled, linear)
 
-    def _is_marched(self, element: Nonlinear) -> bool:
-        """True for elements whose hits are marched."""
-        if not self.problem.marched_sizes:
-            return False
-        return parts(element) or any(
-            element.name in names for names in self.problem.observations.rubbing.values()
-        )
-
     def _marched(
         self,
         x: NDArray[np.float64],
@@ -246,9 +250,7 @@ class HitResiduals:
         displacement: NDArray[np.complex128],
     ) -> NDArray[np.complex128] | None:
         """What these elements change, by marching the hits; None where their motion has no bound."""
-        data, lattice = self.data, self.problem.observations.marched
-        if lattice is not None:
-            return lattice.changes(data, self.problem, x)
+        data = self.data
         assert data.pulses is not None
         scale = float(np.exp(x[self.scale]))
         stated = self._motion_of(data.pulses.struck)

@@ -24,6 +24,7 @@ from ema_pipeline.observations.fitting import (
     transferred,
     wide,
 )
+from ema_pipeline.observations.hit_residuals import AMPLITUDE, HitResiduals
 
 LABEL = "dry_friction@hub"
 FORCE = f"{LABEL}.force"
@@ -102,21 +103,45 @@ def test_only_friction_is_calculated_in_full_and_once() -> None:
     assert endless.in_full(fit.model.effects, fit.posterior) is None
 
 
+def test_linearised_friction_is_found_once_for_all_that_is_fitted_beside_it() -> None:
+    observations, fit = linearised(0.1)
+    (data,), lattice = observations.hits, observations.lattice
+    assert lattice is not None
+    problem, sizes = fit.model.problem(observations), fit.posterior.x
+    changes = lattice.changes(data, problem, sizes)
+    known = len(lattice._nodes)
+    x = transferred(lattice._found, problem.unknowns)
+    at = list(problem.lattice_sizes)
+    x[at] = sizes[at]
+    x[problem.unknowns.index[AMPLITUDE]] = sizes[problem.unknowns.index[AMPLITUDE]]
+    paired = problem.modes.paired(data.reference, x[: len(problem.modes.unknowns)], None)
+    assert paired is not None
+    here = HitResiduals(problem, data, paired, x, fit.posterior.scatters, 1.0)
+    exact = here.calculated(x, lambda element: True)
+    assert np.max(np.abs(changes - exact)) < 3e-3 * np.max(np.abs(exact)) > 0
+    cubic = parse_effect("cubic_spring@hub.x", RIG, library=shipped_effects())
+    more = fit.model.plus(cubic, {}).problem(observations)
+    np.testing.assert_array_equal(
+        lattice.changes(data, more, transferred(fit.posterior, more.unknowns)), changes
+    )
+    assert len(lattice._nodes) == known
+
+
 def test_larger_motions_are_as_smaller_forces_and_rates() -> None:
     observations, fit = linearised(0.1)
     full = calculated_in_full(observations, fit)
-    assert full.marched is not None
+    assert full.lattice is not None
     problem, x = fit.model.problem(full), fit.posterior.x.copy()
     index = problem.unknowns.index
-    names, at = full.marched._place(problem, x)
+    names, at = full.lattice._place(problem, x, problem.lattice_sizes)
     assert names == [FORCE, f"{LABEL}.velocity"]
     x[index["amplitude of all modes"]] += 0.3
-    further = full.marched._place(problem, x)[1]
+    further = full.lattice._place(problem, x, problem.lattice_sizes)[1]
     x[index[FORCE]] *= np.exp(0.3)
     rate = problem.sizes[f"{LABEL}.velocity"]
     x[index[f"{LABEL}.velocity"]] = rate.unknown(rate.value(x[index[f"{LABEL}.velocity"]]) * np.exp(0.3))
     assert np.all(further < at)
-    np.testing.assert_allclose(full.marched._place(problem, x)[1], at)
+    np.testing.assert_allclose(full.lattice._place(problem, x, problem.lattice_sizes)[1], at)
 
 
 @dataclass(frozen=True)
@@ -138,7 +163,8 @@ def test_a_calculation_in_full_that_explains_the_data_far_worse_is_left(
 
     def behind(by: float) -> None:
         """Friction in full gains that much less than to first order, on rows that are known alike."""
-        monkeypatch.setattr(in_full, "refined", lambda data, *asked: Fitted(-by if data.rubbing else 0.0))
+        monkeypatch.setattr(in_full, "refined", lambda *asked: Fitted(0.0))
+        monkeypatch.setattr(in_full, "best_refined", lambda *asked: Fitted(-by))
 
     behind(9.9)
     assert in_full.in_full(found).final.log_evidence == -9.9

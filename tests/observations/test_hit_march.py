@@ -19,7 +19,7 @@ from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.observations.amplitude import AmplitudeObservations
 from ema_pipeline.observations.fitting import Model, fit_base
 from ema_pipeline.observations.hit_data import HitData
-from ema_pipeline.observations.hit_lattice import on_lattice
+from ema_pipeline.observations.hit_lattice import uninterpolated
 from ema_pipeline.observations.hit_march import Driven, marched_modes
 from ema_pipeline.observations.hit_modes import Linear, changed_modes
 from ema_pipeline.observations.hit_reading import drive_gains, momentary_weights
@@ -124,8 +124,8 @@ def test_marched_hits_lie_straight_between_those_of_the_lattice_in_any_order() -
         at = problem.unknowns.index["mesh_backlash@hub-rim.preload"]
         x[at] = unknown
         x[problem.unknowns.index[AMPLITUDE]] = 0.0
-        assert about.marched is not None
-        return about.marched.changes(data, problem, x)
+        assert about.lattice is not None
+        return about.lattice.changes(data, problem, x)
 
     places = (2.0, 2.02, 2.05)
     first, second = (observations.about((), base.posterior) for _ in range(2))
@@ -136,11 +136,11 @@ def test_marched_hits_lie_straight_between_those_of_the_lattice_in_any_order() -
     low, between, high = forward
     np.testing.assert_allclose(between, low + 0.4 * (high - low), rtol=1e-9, atol=1e-12)
     some = data.only(data.level > 0)
-    assert first.marched is not None
+    assert first.lattice is not None
     problem = first.problem(effects, {})
     x = problem.start()
-    whole = first.marched.changes(data, problem, x)
-    np.testing.assert_array_equal(first.marched.changes(some, problem, x), whole[:, data.level > 0])
+    whole = first.lattice.changes(data, problem, x)
+    np.testing.assert_array_equal(first.lattice.changes(some, problem, x), whole[:, data.level > 0])
 
 
 def test_sizes_that_are_tried_lie_on_the_lattice_where_each_costs_one_march() -> None:
@@ -149,11 +149,11 @@ def test_sizes_that_are_tried_lie_on_the_lattice_where_each_costs_one_march() ->
     problem = about.problem([parse_effect("mesh_backlash@hub-rim", RIG)], {})
     x = problem.start({"mesh_backlash@hub-rim.preload": PRELOAD, "mesh_backlash@hub-rim.gap": 1e-2})
     x[problem.unknowns.index[AMPLITUDE]] = 0.013
-    lattice = about.marched
+    lattice = about.lattice
     assert lattice is not None
-    moved = on_lattice(problem, x)
-    at = lattice._place(problem, moved)[1]
-    np.testing.assert_allclose(at, np.rint(lattice._place(problem, x)[1]), atol=1e-9)
+    moved = uninterpolated(problem, x)
+    at = lattice._place(problem, moved, problem.lattice_sizes)[1]
+    np.testing.assert_allclose(at, np.rint(lattice._place(problem, x, problem.lattice_sizes)[1]), atol=1e-9)
     others = np.setdiff1d(np.arange(len(x)), problem.marched_sizes)
     np.testing.assert_array_equal(moved[others], x[others])
     (data,) = about.hits
