@@ -36,6 +36,8 @@ _PARALLEL = 0.95
 """Cosine of what an effect and what a part change from which they are the same place."""
 _TIE = 0.1
 """Difference of log evidence within which the order of two effects is that of their names."""
+_SECOND = 2 * _TIE
+"""By how much what is as good as the best stays behind it: what is added first is what the evidence prefers."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def round_of(
         judged.append(judge(observations, ranking, one, settings, nothing, judged))
     best = max((j for j in judged if j.claimed), key=lambda j: j.gain, default=None)
     if best is not None:
-        judged = [replace(j, gain=best.gain) if _as_good(j, best) else j for j in judged]
+        judged = [replace(j, gain=best.gain - _SECOND) if _as_good(j, best) else j for j in judged]
     return weighed(ranking, sorted(judged, key=lambda j: -j.gain), hypotheses, settings, found)
 
 

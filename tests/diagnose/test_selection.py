@@ -502,7 +502,7 @@ def test_a_rival_that_predicts_better_is_level_where_linearisation_may_account_f
     monkeypatch.setattr(rounds, "weighed", lambda ranking, found, *rest: found)
     data: Any = None
     told: Any = rounds.round_of(data, given, [], SETTINGS, 0)
-    assert [j.gain for j in told] == [150.0, 150.0 if level else 150.0 - behind]
+    assert [j.gain for j in told] == [150.0, 150.0 - (0.2 if level else behind)]
 
 
 def replaced(one: Any, **changes: Any) -> Any:
