@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.description import DESCRIPTION_FILE
-from ema_pipeline.results_folder import RESULTS_FILE
+from ema_pipeline.results_folder import FILES, RESULTS_FILE
 
 SERIES_FILE, CHANGES_FILE = "series.db", "changes.json"
 
@@ -17,9 +17,12 @@ ANSWERS = {
 }
 """Files by whose names a folder is known to hold an answer, and of what."""
 
+_TOGETHER = {"summary.json", "report.html"}
+"""Files of a run that stay together, also where its results were deleted."""
+
 
 def check_answer_folder(folder: Path, own: str) -> None:
-    """Refuse a folder that holds an answer of another kind, whose report and tables would be replaced, or raw data.
+    """Refuse a folder that holds an answer of another kind, raw data, or files of the user's that would be replaced.
 
     Parameters
     ----------
@@ -41,3 +44,8 @@ def check_answer_folder(folder: Path, own: str) -> None:
     for name, words in ANSWERS.items():
         if name != own and (folder / name).is_file():
             raise EmaError(f"{folder}: holds {words}, whose report would be lost; name another with --out")
+    others = [name for name in FILES if (folder / name).exists()]
+    if others and not (folder / own).is_file() and not set(others) >= _TOGETHER:
+        raise EmaError(
+            f"{folder}: ema did not write {others[0]}, and would replace it; name another with --out"
+        )
