@@ -155,6 +155,16 @@ class HitData:
         pulses = self.pulses and self.pulses.only(keep)
         return replace(self, names=names, pulses=pulses, **{n: getattr(self, n)[keep] for n in of_hits})
 
+    def within(self, reference: ModeData) -> HitData:
+        """The modes that are among the first ones of the reference, which `reference` has."""
+        kept = self.modes < len(reference)
+        of_hits = (
+            "log_frequency", "log_frequency_std", "damping", "damping_std", "motion", "size", "size_std",
+        )  # fmt: skip
+        few = {n: getattr(self, n)[:, kept] for n in of_hits}
+        few |= {n: getattr(self, n)[kept] for n in ("modes", "shapes", "band_hz")}
+        return replace(self, reference=reference, **few)
+
     @cached_property
     def poles(self) -> Complex:
         """Of every mode in every hit, 1/s, (h, m); the reference's where a hit tells none that can be compared."""

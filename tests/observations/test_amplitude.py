@@ -617,6 +617,30 @@ def test_the_modes_of_the_softest_hits_are_those_that_the_effect_makes_of_them()
     assert worst[1] < 0.2 * worst[0], worst
 
 
+def test_modes_above_the_models_reach_are_none_of_the_hits() -> None:
+    """Beside them, what friction does to the modes of the level was left out, and a calculation in full failed."""
+    observations = synthetic([DryFriction(f"f{a}", {f"hub.{a}": 1.0}, 0.3) for a in "xy"])
+    (hits,), (modes,) = observations.hits, observations.modes.data
+    below = np.arange(len(modes)) < len(modes) - 1
+    fewer = replace(modes.only(below), whole=None, kept=None)
+    few, kept = hits.within(fewer), hits.modes < len(fewer)
+    assert few.reference is fewer
+    np.testing.assert_array_equal(few.modes, hits.modes[kept])
+    assert few.log_frequency.shape == few.size.shape == (len(hits.names), kept.sum())
+    assert few.shapes.shape[0] == len(few.band_hz) == kept.sum() < len(hits.modes)
+    assert len(few.with_friction(fewer)) == len(fewer)
+    of_fewer = AmplitudeObservations(observations.modes.with_data([fewer]), [few])
+    model = Model((parse_effect("dry_friction@hub", RIG),), {})
+
+    def values(data: AmplitudeObservations, force: float) -> np.ndarray:
+        problem = model.problem(data)
+        x = problem.start({"dry_friction@hub.force": force})
+        found = problem.residuals(x, {n: s.start for n, s in data.scatters.items()}, derivatives=False)
+        return found.values[: len(fewer)]
+
+    assert np.max(np.abs(values(of_fewer, 0.3) - values(of_fewer, 0.0))) > 1.0
+
+
 def test_poles_that_move_far_are_read_less_well_than_near_ones() -> None:
     """σ grows with the square of the distance at first: a tenth of a width is read as if nothing were left out."""
     hits = synthetic().hits[0]
