@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ema_pipeline.effects.base import Effect, EffectParameter
-from ema_pipeline.effects.generic import bodies_and_dofs, is_place, place_rows
+from ema_pipeline.effects.generic import bodies_joints_and_dofs, is_place, place_rows
 from ema_pipeline.effects.isolators import isolators
 from ema_pipeline.effects.places import bodies_with_bearings
 from ema_pipeline.mechanics.assembly import Assembly
@@ -13,9 +13,9 @@ from ema_pipeline.mechanics.laws import DryFriction
 
 
 def _places(assembly: Assembly) -> tuple[str, ...]:
-    """Bodies on bearings; all bodies and DOFs of a rig that names neither bearings nor isolators."""
+    """Bodies on bearings; bodies, joints and DOFs of a rig that names neither bearings nor isolators."""
     own = bodies_with_bearings(assembly)
-    return own if own or isolators(assembly) else bodies_and_dofs(assembly)
+    return own if own or isolators(assembly) else bodies_joints_and_dofs(assembly)
 
 
 def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:

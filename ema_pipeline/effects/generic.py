@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 
 from ema_pipeline.mechanics.assembly import Assembly, Mass, Row, difference
 from ema_pipeline.mechanics.laws import PolynomialSpring
-
-
-def bodies_and_dofs(assembly: Assembly) -> tuple[str, ...]:
-    """Bodies first, then single DOFs: what is simpler to say comes first."""
-    return (*assembly.bodies, *assembly.dofs)
-
 
 SUSPENDING = 0.05
 """Stiffness of a spring to ground over the median of those between bodies below which it only carries the structure."""
@@ -37,7 +31,19 @@ def bodies_and_lone_dofs(assembly: Assembly) -> tuple[str, ...]:
 
 def bodies_pairs_and_dofs(assembly: Assembly) -> tuple[str, ...]:
     """Bodies, pairs of bodies that share a direction, then single DOFs and pairs of DOFs of one direction."""
-    bodies = [(a, b, _shared(assembly, a, b)) for a, b in combinations(assembly.bodies, 2)]
+    return _with_pairs(assembly, combinations(assembly.bodies, 2))
+
+
+def bodies_joints_and_dofs(assembly: Assembly) -> tuple[str, ...]:
+    """The same with those pairs alone that a spring joins: only what touches rubs."""
+    joined = {frozenset(dof.rpartition(".")[0] for dof in s.row) for s in assembly.springs()}
+    return _with_pairs(
+        assembly, (pair for pair in combinations(assembly.bodies, 2) if frozenset(pair) in joined)
+    )
+
+
+def _with_pairs(assembly: Assembly, chosen: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+    bodies = [(a, b, _shared(assembly, a, b)) for a, b in chosen]
     pairs = [f"{a}-{b}" for a, b, shared in bodies if shared]
     lone = [f"{a}.{d}-{b}.{d}" for a, b, shared in bodies if len(shared) > 1 for d in shared]
     return (*assembly.bodies, *pairs, *assembly.dofs, *lone)
