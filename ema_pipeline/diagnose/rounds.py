@@ -36,6 +36,8 @@ _PARALLEL = 0.95
 """Cosine of what an effect and what a part change from which they are the same place."""
 _TIE = 0.1
 """Difference of log evidence within which the order of two effects is that of their names."""
+_ROUGH = 10.0
+"""The same within which friction at one place or another may: its evidence jumps so far from one force to the next."""
 _SECOND = 2 * _TIE
 """By how much what is as good as the best stays behind it: what is added first is what the evidence prefers."""
 
@@ -101,16 +103,20 @@ def round_of(
         judged.append(judge(observations, ranking, one, settings, nothing, judged))
     best = max((j for j in judged if j.claimed), key=lambda j: j.gain, default=None)
     if best is not None:
-        judged = [replace(j, gain=best.gain - _SECOND) if _as_good(j, best) else j for j in judged]
+        judged = [replace(j, gain=_levelled(observations, j, best)) for j in judged]
     return weighed(ranking, sorted(judged, key=lambda j: -j.gain), hypotheses, settings, found)
 
 
-def _as_good(one: Judged, best: Judged) -> bool:
-    """True where one predicts held-out data better than the best, whose lead in evidence may be no more than what
-    equivalent linearisation leaves out of both.
+def _levelled(observations: Observations, one: Judged, best: Judged) -> float:
+    """Its gain; nearly that of the best where this leads by no more than what equivalent linearisation leaves out of
+    both, and predicts held-out data worse, or where both are known to first order only, as friction.
     """
-    near = one.claimed and best.gain - one.gain < min(one.linearisation, best.linearisation)
-    return near and one.held_after.log_density > best.held_after.log_density
+    lead, both = best.gain - one.gain, (one, best)
+    if one is best or not one.claimed or lead >= min(one.linearisation, best.linearisation):
+        return one.gain
+    rough = all(observations.in_full([j.hypothesis.placed], j.after.posterior) for j in both)
+    better = one.held_after.log_density > best.held_after.log_density
+    return best.gain - _SECOND if better or (rough and lead < _ROUGH) else one.gain
 
 
 def _with_relief(observations: Observations, ranking: Ranking, settings: DiagnoseSettings) -> Ranking:

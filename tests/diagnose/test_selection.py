@@ -472,18 +472,26 @@ def test_where_the_base_model_fails_at_usual_scatters_effects_are_compared_at_th
 
 
 @pytest.mark.parametrize(
-    ("linearisation", "behind", "predicts", "level"),
+    ("linearisation", "behind", "predicts", "rough", "level"),
     [
-        (17.0, 12.0, -9.0, True),
-        (17.0, 12.0, -11.0, False),
-        (17.0, 18.0, -9.0, False),
-        (0.0, 1.0, -9.0, False),
+        (17.0, 12.0, -9.0, False, True),
+        (17.0, 12.0, -11.0, False, False),
+        (17.0, 18.0, -9.0, False, False),
+        (0.0, 1.0, -9.0, False, False),
+        (17.0, 8.0, -11.0, True, True),
+        (17.0, 12.0, -11.0, True, False),
     ],
 )
-def test_a_rival_that_predicts_better_is_level_where_linearisation_may_account_for_the_lead(
-    monkeypatch: pytest.MonkeyPatch, linearisation: float, behind: float, predicts: float, level: bool
+def test_a_rival_is_level_where_linearisation_may_account_for_the_lead_and_it_predicts_better_or_is_friction(
+    monkeypatch: pytest.MonkeyPatch,
+    linearisation: float,
+    behind: float,
+    predicts: float,
+    rough: bool,
+    level: bool,
 ) -> None:
-    """Teeth that part at the ring were 11.7 behind those at the sun, which held-out hits spoke against by 14."""
+    """Teeth that part at the ring were 11.7 behind those at the sun, which held-out hits spoke against by 14; friction
+    between two masses of a chain was 7.4 behind friction of another."""
 
     def rival(label: str, gain: float, density: float) -> Any:
         one = judged(label, gain, linear=False)
@@ -500,7 +508,7 @@ def test_a_rival_that_predicts_better_is_level_where_linearisation_may_account_f
     monkeypatch.setattr(rounds, "judge", lambda o, ranking, one, *rest: known[one.name])
     monkeypatch.setattr(rounds, "replace", replaced)
     monkeypatch.setattr(rounds, "weighed", lambda ranking, found, *rest: found)
-    data: Any = None
+    data: Any = SimpleNamespace(in_full=lambda effects, found: (1, 2) if rough else None)
     told: Any = rounds.round_of(data, given, [], SETTINGS, 0)
     assert [j.gain for j in told] == [150.0, 150.0 - (0.2 if level else behind)]
 
@@ -532,6 +540,7 @@ def test_a_linearised_effect_is_one_of_many_where_a_better_one_is_doubted(
 
 
 def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rounds, "replace", replaced)
     ranked = [SimpleNamespace(gain=g, final=g < 5.0) for g in (1.0, 9.0, 4.0, 2.0)]
     told = {NOTHING: 0.1}
     monkeypatch.setattr(rounds, "_with_relief", lambda o, ranking, settings: ranking)
