@@ -37,7 +37,7 @@ _PARALLEL = 0.95
 _TIE = 0.1
 """Difference of log evidence within which the order of two effects is that of their names."""
 _ROUGH = 10.0
-"""The same within which friction at one place or another may: its evidence jumps so far from one force to the next."""
+"""The same within which friction may be at either of two places: its evidence jumps so far from force to force."""
 _SECOND = 2 * _TIE
 """By how much what is as good as the best stays behind it: what is added first is what the evidence prefers."""
 

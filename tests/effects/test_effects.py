@@ -178,6 +178,13 @@ def test_what_is_held_has_no_suspension_to_be_found(springs: tuple[float, ...]) 
     assert not get_effect("suspension").places(RIG, "no_ring")
 
 
+def test_friction_is_sought_at_bodies_and_where_a_spring_joins_two() -> None:
+    chain, effect = chain_of(1e5, 2e5, 3e5, 0.0), get_effect("dry_friction")
+    assert effect.find_places(chain) == ("m1", "m2", "m3", "m1-m2", "m2-m3", "m1.x", "m2.x", "m3.x")
+    assert effect.fits(chain, "m1-m3")  # which a user may name
+    assert effect.places(RIG, "no_ring") == ("carrier", "sun")
+
+
 def test_a_suspension_holds_every_direction_of_a_body_and_not_its_rotation() -> None:
     dofs = ("a.x", "a.y", "a.u")
     masses = [Mass(d, {d: 1.0}, m) for d, m in zip(dofs, (4.0, 4.0, 1.0), strict=True)]
