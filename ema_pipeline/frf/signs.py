@@ -23,7 +23,7 @@ STRONG_FORCE = 0.01
 
 ACROSS_LEVEL = 0.8
 """FRFs across the blow above this share of the largest one along it have the structure's sign. A mode across that is
-damped a third as much as those along a blow that is 8° off answers with 0.5, at either sign."""
+damped a third as much as those along a blow that is 8° off answers with 0.4, at either sign."""
 
 _BLOCKS = 64
 _FIRST_LINE = 4

@@ -319,10 +319,16 @@ class AmplitudeProblem(EffectProblem):
         return {label: names for label, names in found.items() if names}
 
     @cached_property
-    def lattice_sizes(self) -> tuple[int, ...]:
-        """Positions of the sizes of effects that are found on the lattice about one fit: marched ones and friction."""
-        rubbing = [i for i in self.nonlinear_sizes if self.rubs(self.unknowns.names[i])]
-        return tuple(sorted({*self.marched_sizes, *rubbing}))
+    def lattice_groups(self) -> tuple[tuple[int, ...], ...]:
+        """Positions of the sizes that span a lattice about one fit each: of every friction that is linearised, and of
+        all that is marched, whose elements move each other.
+        """
+        linearised: dict[str, list[int]] = {}
+        for i in self.nonlinear_sizes:
+            name = self.unknowns.names[i]
+            if self.rubs(name) and i not in self.marched_sizes:
+                linearised.setdefault(effect_of(name), []).append(i)
+        return tuple(filter(None, (*map(tuple, linearised.values()), self.marched_sizes)))
 
     def rubs(self, name: str) -> bool:
         """True for a size of an effect that is all friction."""
@@ -349,9 +355,9 @@ class AmplitudeProblem(EffectProblem):
         rate and amplitude together change nothing.
         """
         name = self.unknowns.names[i]
-        if i in self.marched_sizes and not self.rubs(name):
-            return _MARCHED_STEP
-        if self.observations.lattice is None or not self.rubs(name):
+        if not self.rubs(name):
+            return _MARCHED_STEP if i in self.marched_sizes else _STEP
+        if self.observations.lattice is None:
             return _STEP
         if self.sizes[name].logarithmic:
             return -_MARCHED_STEP

@@ -23,7 +23,9 @@ from ema_pipeline.levels.types import HitModes, Pulses
 from ema_pipeline.mechanics.sampling import straightened
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.observations.mode_data import ModeData, prepare
+from ema_pipeline.observations.reach import within_reach
 from ema_pipeline.observations.ringing import Ringing
+from ema_pipeline.rigs.types import Rig
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -52,6 +54,11 @@ _HEARD = 0.1
 """Motion of a mode over that of the largest that moves in step with it, below which a hit does not tell its pole."""
 _QUIET_S = 0.01
 """Time after every blow in which what is left of its force at steps between samples rings off, s."""
+
+
+_OF_HITS_AND_MODES = (
+    "log_frequency", "log_frequency_std", "damping", "damping_std", "motion", "size", "size_std",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -147,10 +154,7 @@ class HitData:
 
     def only(self, keep: NDArray[np.bool_]) -> HitData:
         """Some of the hits."""
-        of_hits = (
-            "level", "sheet", "log_frequency", "log_frequency_std", "damping", "damping_std", "motion", "size",
-            "size_std",
-        )  # fmt: skip
+        of_hits = ("level", "sheet", *_OF_HITS_AND_MODES)
         names = tuple(n for n, k in zip(self.names, keep, strict=True) if k)
         pulses = self.pulses and self.pulses.only(keep)
         return replace(self, names=names, pulses=pulses, **{n: getattr(self, n)[keep] for n in of_hits})
@@ -158,10 +162,7 @@ class HitData:
     def within(self, reference: ModeData) -> HitData:
         """The modes that are among the first ones of the reference, which `reference` has."""
         kept = self.modes < len(reference)
-        of_hits = (
-            "log_frequency", "log_frequency_std", "damping", "damping_std", "motion", "size", "size_std",
-        )  # fmt: skip
-        few = {n: getattr(self, n)[:, kept] for n in of_hits}
+        few = {n: getattr(self, n)[:, kept] for n in _OF_HITS_AND_MODES}
         few |= {n: getattr(self, n)[kept] for n in ("modes", "shapes", "band_hz")}
         return replace(self, reference=reference, **few)
 
@@ -384,6 +385,7 @@ def prepare_hits(
     force_n: Sequence[float],
     reference_level: int | None = None,
     level_dependent: bool = False,
+    rig: Rig | None = None,
 ) -> HitData | None:
     """What single hits tell, prepared; None where no sheet was struck at several levels.
 
@@ -399,6 +401,8 @@ def prepare_hits(
         Level that `modal` is of; all hits where left out.
     level_dependent : bool, optional
         What the study of the levels leaves no doubt of.
+    rig : Rig, optional
+        Modes above the reach of its model are left out.
     """
     data = HitData(
         prepare(from_modal_model(modal, configuration)),
@@ -423,6 +427,8 @@ def prepare_hits(
         level_dependent,
         hits.pulses,
     )
+    if rig is not None:  # those above are the last ones
+        data = data.within(within_reach(data.reference, rig))
     return data if comparable(data) else None
 
 

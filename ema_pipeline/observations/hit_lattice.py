@@ -53,17 +53,9 @@ class SizeLattice:
         self._nodes: dict[tuple[object, ...], Complex] = {}
 
     def changes(self, data: HitData, problem: AmplitudeProblem, x: NDArray[np.float64]) -> Complex:
-        """What the effects on the lattice change, as `HitResiduals.moved` has it, of all or some hits.
-
-        Marched elements move each other; friction that is linearised is found by itself for every effect.
-        """
-        names = {i: problem.unknowns.names[i] for i in problem.lattice_sizes}
-        own = {i: effect_of(name) for i, name in names.items() if i not in problem.marched_sizes}
-        groups = [[i for i, of in own.items() if of == label] for label in dict.fromkeys(own.values())]
-        groups += [list(problem.marched_sizes)] if problem.marched_sizes else []
-        return sum(
-            (self._interpolated(data, problem, x, group) for group in groups), np.zeros((2, 1, 1), complex)
-        )
+        """What the effects on the lattice change, as `HitResiduals.moved` has it, of all or some hits."""
+        found = (self._interpolated(data, problem, x, group) for group in problem.lattice_groups)
+        return sum(found, np.zeros((2, 1, 1), complex))
 
     def _interpolated(
         self, data: HitData, problem: AmplitudeProblem, x: NDArray[np.float64], sizes: Sequence[int]

@@ -204,13 +204,11 @@ class HitResiduals:
         return known[key]
 
     def _found_moved(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
-        lattice = self.problem.observations.lattice
-        if lattice is None:
+        lattice, on_lattice = self.problem.observations.lattice, self.problem.on_lattice
+        if lattice is None or not any(map(on_lattice, self._assembly(x).nonlinear)):
             return self.calculated(x, lambda element: True)
-        total = self.calculated(x, lambda element: not self.problem.on_lattice(element))
-        if any(map(self.problem.on_lattice, self._assembly(x).nonlinear)):
-            total += lattice.changes(self.data, self.problem, x)
-        return total
+        others = self.calculated(x, lambda element: not on_lattice(element))
+        return others + lattice.changes(self.data, self.problem, x)
 
     def calculated(
         self, x: NDArray[np.float64], wanted: Callable[[Nonlinear], bool]

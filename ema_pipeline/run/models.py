@@ -59,7 +59,7 @@ def amplitude_observations(run: Run) -> AmplitudeObservations | None:
     """Modes and hits of all configurations; None where none was struck at several levels."""
     from ema_pipeline.levels.harmonics import may_be_products
     from ema_pipeline.observations.amplitude import AmplitudeObservations
-    from ema_pipeline.observations.hit_data import comparable, prepare_hits
+    from ema_pipeline.observations.hit_data import prepare_hits
 
     hits, products = [], {}
     for name, study in level_studies(run).items():
@@ -68,7 +68,7 @@ def amplitude_observations(run: Run) -> AmplitudeObservations | None:
         modal = modes_of_structure(run, name)
         forces = [level.force_n for level in study.levels]
         data = prepare_hits(
-            name, study.hit_modes, modal, forces, study.linear_level, study.clearly_level_dependent
+            name, study.hit_modes, modal, forces, study.linear_level, study.clearly_level_dependent, run.rig
         )
         if data is not None:
             hits.append(data)
@@ -76,14 +76,11 @@ def amplitude_observations(run: Run) -> AmplitudeObservations | None:
     if not hits:
         return None
     modes = mode_observations(run)
-    # modes that are not compared are the last ones
-    hits = [h.within(within_reach(h.reference, modes.rig)) for h in hits]
-    marked = [
+    marked = [  # modes that are not compared are the last ones
         replace(d, product=products[d.configuration][: len(d)] if d.configuration in products else None)
         for d in modes.data
     ]
-    hits = [h for h in hits if comparable(h)]
-    return AmplitudeObservations(modes.with_data(marked), hits) if hits else None
+    return AmplitudeObservations(modes.with_data(marked), hits)
 
 
 def known_model(run: Run, hits: AmplitudeObservations | None = None) -> Model:

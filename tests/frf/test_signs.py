@@ -74,9 +74,10 @@ def test_a_response_across_the_blow_may_change_its_sign() -> None:
 
 def test_a_sensor_across_the_blow_reads_more_of_an_oblique_one_than_a_sensor_along_it() -> None:
     """More than a fifth of the largest response may change its sign with the aim; along the blow it may not."""
-    hits = [hit(1, (1.0, 0.45)), hit(2, (1.0, -0.45))]
-    assert not signs(hits)["p1.z over p0.z"].passes
-    assert "p1.x over p0.z" not in signs([described(h, "a1", direction="x") for h in hits])
+    for size in (0.25, 0.45):
+        hits = [hit(1, (1.0, size)), hit(2, (1.0, -size))]
+        assert not signs(hits)["p1.z over p0.z"].passes
+        assert "p1.x over p0.z" not in signs([described(h, "a1", direction="x") for h in hits])
     hits = [hit(1, (1.0, 0.6)), hit(2, (1.0, -0.6))]
     assert not signs([described(h, "a1", direction="x") for h in hits])["p1.x over p0.z"].passes
 

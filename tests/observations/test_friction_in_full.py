@@ -111,7 +111,8 @@ def test_linearised_friction_is_found_once_for_all_that_is_fitted_beside_it() ->
     changes = lattice.changes(data, problem, sizes)
     known = len(lattice._nodes)
     x = transferred(lattice._found, problem.unknowns)
-    at = list(problem.lattice_sizes)
+    (group,) = problem.lattice_groups
+    at = list(group)
     x[at] = sizes[at]
     x[problem.unknowns.index[AMPLITUDE]] = sizes[problem.unknowns.index[AMPLITUDE]]
     paired = problem.modes.paired(data.reference, x[: len(problem.modes.unknowns)], None)
@@ -133,15 +134,15 @@ def test_larger_motions_are_as_smaller_forces_and_rates() -> None:
     assert full.lattice is not None
     problem, x = fit.model.problem(full), fit.posterior.x.copy()
     index = problem.unknowns.index
-    names, at = full.lattice._place(problem, x, problem.lattice_sizes)
+    names, at = full.lattice._place(problem, x, problem.lattice_groups[0])
     assert names == [FORCE, f"{LABEL}.velocity"]
     x[index["amplitude of all modes"]] += 0.3
-    further = full.lattice._place(problem, x, problem.lattice_sizes)[1]
+    further = full.lattice._place(problem, x, problem.lattice_groups[0])[1]
     x[index[FORCE]] *= np.exp(0.3)
     rate = problem.sizes[f"{LABEL}.velocity"]
     x[index[f"{LABEL}.velocity"]] = rate.unknown(rate.value(x[index[f"{LABEL}.velocity"]]) * np.exp(0.3))
     assert np.all(further < at)
-    np.testing.assert_allclose(full.lattice._place(problem, x, problem.lattice_sizes)[1], at)
+    np.testing.assert_allclose(full.lattice._place(problem, x, problem.lattice_groups[0])[1], at)
 
 
 @dataclass(frozen=True)
@@ -163,8 +164,8 @@ def test_a_calculation_in_full_that_explains_the_data_far_worse_is_left(
 
     def behind(by: float) -> None:
         """Friction in full gains that much less than to first order, on rows that are known alike."""
-        monkeypatch.setattr(in_full, "refined", lambda *asked: Fitted(0.0))
-        monkeypatch.setattr(in_full, "best_refined", lambda *asked: Fitted(-by))
+        for name in ("refined", "best_refined"):
+            monkeypatch.setattr(in_full, name, lambda data, *asked: Fitted(-by if data.rubbing else 0.0))
 
     behind(9.9)
     assert in_full.in_full(found).final.log_evidence == -9.9

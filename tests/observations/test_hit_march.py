@@ -152,8 +152,10 @@ def test_sizes_that_are_tried_lie_on_the_lattice_where_each_costs_one_march() ->
     lattice = about.lattice
     assert lattice is not None
     moved = uninterpolated(problem, x)
-    at = lattice._place(problem, moved, problem.lattice_sizes)[1]
-    np.testing.assert_allclose(at, np.rint(lattice._place(problem, x, problem.lattice_sizes)[1]), atol=1e-9)
+    at = lattice._place(problem, moved, problem.lattice_groups[0])[1]
+    np.testing.assert_allclose(
+        at, np.rint(lattice._place(problem, x, problem.lattice_groups[0])[1]), atol=1e-9
+    )
     others = np.setdiff1d(np.arange(len(x)), problem.marched_sizes)
     np.testing.assert_array_equal(moved[others], x[others])
     (data,) = about.hits
