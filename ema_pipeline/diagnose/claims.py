@@ -88,11 +88,6 @@ class Judged:
         return not self.doubt
 
     @property
-    def predicts_worse(self) -> bool:
-        """True where held-out data alone speak against it."""
-        return self.doubt == PREDICTED_WORSE
-
-    @property
     def contradicted(self) -> bool:
         """True where error or held-out data speak against what the evidence supports."""
         return self.doubt in (NO_LESS_ERROR, PREDICTED_WORSE)

@@ -121,16 +121,16 @@ def select(
     while True:
         leading = earlier.leading if len(claimed) < earlier.rounds and ahead is None else ()
         found, ahead = ahead or ask(base, claimed, rounds, leading), None
-        leader = _tentative(observations, found, settings)
-        if leading and found.best is None and leader is None:
+        if leading and found.best is None and not _tentative(observations, found, settings):
             found = ask(base, claimed, rounds)
-            leader = _tentative(observations, found, settings)
-        if leader is not None and len(claimed) + 1 < settings.most_effects:
+        leaders = _tentative(observations, found, settings)
+        for leader in leaders if len(claimed) + 1 < settings.most_effects else ():
             base = fit_base(observations, leader.ranked.fit.model, leader.ranked.fit)
             further = ask(base, [*claimed, leader], [*rounds, found])
             both = _both(observations, found, further, settings)
             if both is not None:
                 found, ahead = _acquitted(found, leader, both, hypotheses, settings, len(claimed)), further
+                break
         rounds.append(found)
         near = found.alike(settings)
         if not near or len(claimed) == settings.most_effects:
@@ -186,21 +186,21 @@ def _beside(
     return settings.model_copy(update={"claim": settings.claim + left, "doubt": doubt})
 
 
-def _tentative(observations: Observations, found: Round, settings: DiagnoseSettings) -> Judged | None:
-    """What cannot be claimed alone and may be right beside a second effect; None where there is nothing.
+def _tentative(observations: Observations, found: Round, settings: DiagnoseSettings) -> tuple[Judged, ...]:
+    """What cannot be claimed alone and may be right beside a second effect, what leads first.
 
-    The fit with one of two missing effects bends parts for the other one. So what leads may predict data held out
-    worse, and where the base model fails, what reduces its error most may gain nothing.
+    The fit with one of two missing effects bends parts for the other one. So error or held-out data may contradict what
+    leads, and where the base model fails, what reduces its error most may gain nothing.
     """
     if found.best is not None or not found.judged:
-        return None
-    if found.judged[0].predicts_worse:
-        return found.judged[0]
-    least = min(found.judged, key=lambda j: j.after.posterior.error)
-    if observations.linearised or least.after.posterior.error >= least.base.posterior.error:
-        return None
+        return ()
+    leads, least = found.judged[0], min(found.judged, key=lambda j: j.after.posterior.error)
+    leading = (leads,) if leads.contradicted else ()
+    reduces = least.after.posterior.error < least.base.posterior.error
+    if observations.linearised or not reduces or (least is leads and leading):
+        return leading
     base = within_scatter(observations, found.ranking.base)
-    return least if base.posterior.fails(settings.error_limit) else None
+    return (*leading, least) if base.posterior.fails(settings.error_limit) else leading
 
 
 def _both(

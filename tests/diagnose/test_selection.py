@@ -61,7 +61,7 @@ def judged(
         specific=specific and not generic,
         doubt=doubt,
         claimed=not doubt,
-        predicts_worse=doubt == PREDICTED_WORSE,
+        contradicted=doubt in (NO_LESS_ERROR, PREDICTED_WORSE),
         may_be_zero=doubt.startswith(MAY_BE_ZERO),
         base=SimpleNamespace(posterior=SimpleNamespace(error=2.0)),
         after=SimpleNamespace(posterior=SimpleNamespace(error=1.0)),
@@ -318,11 +318,11 @@ def as_judged(label: str, gain: float, doubt: str) -> Judged:
 
 
 @pytest.mark.parametrize(("second_doubt", "holds"), [("", True), ("", False), ("weak", False)])
-@pytest.mark.parametrize("doubt", [PREDICTED_WORSE, "its gain is too small"])
+@pytest.mark.parametrize("doubt", [PREDICTED_WORSE, NO_LESS_ERROR, "its gain is too small"])
 def test_an_effect_that_cannot_be_claimed_alone_is_claimed_where_it_holds_with_a_second_one(
     monkeypatch: pytest.MonkeyPatch, doubt: str, second_doubt: str, holds: bool
 ) -> None:
-    leads = doubt == PREDICTED_WORSE
+    leads = doubt in (PREDICTED_WORSE, NO_LESS_ERROR)
     a, rival = as_judged("a@x", 29.0 if leads else -11.0, doubt), as_judged("r@x", 20.0, BETTER_CONTRADICTED)
     b, c = as_judged("b@x", 21.0, second_doubt), as_judged("c@x", 1.0, "weak")
     a = dataclasses.replace(a, after=posterior_of(0.9))  # reduces the error most
@@ -355,6 +355,26 @@ def test_an_effect_that_cannot_be_claimed_alone_is_claimed_where_it_holds_with_a
         ]
     else:
         assert first == ((a, rival) if leads else (rival, a))
+
+
+def test_what_reduces_the_error_most_is_tried_where_no_second_effect_holds_beside_what_leads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    leads, least = as_judged("a@x", 20.0, NO_LESS_ERROR), as_judged("b@x", -1.0, "weak")
+    leads = dataclasses.replace(leads, after=posterior_of(2.0))
+    least = dataclasses.replace(least, after=posterior_of(0.9))
+    second = as_judged("c@x", 21.0, "")
+    steps = Steps(monkeypatch, [[leads, least], [second]])
+    steps.error = 1.51
+    tried: list[str] = []
+
+    def both(observations: Any, found: Any, further: Any, settings: Any) -> Any:
+        tried.append(steps.begun[-1][0])
+        return None
+
+    monkeypatch.setattr(selection, "_both", both)
+    assert steps.select([j.hypothesis for j in (leads, least, second)], SETTINGS, []).claimed == ()
+    assert tried == ["a@x", "b@x"]
 
 
 @pytest.mark.parametrize(("error", "linearised"), [(1.5, False), (1.51, True)])
