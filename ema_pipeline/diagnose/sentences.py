@@ -13,6 +13,8 @@ from ema_pipeline.plain_text import part_words
 
 _SHOWN = 3
 """Parts that a sentence names."""
+_LOOKS_RIGHT = 1.3
+"""Error of models that explain the data, as a rule."""
 
 
 def label_text(label: str) -> str:
@@ -101,13 +103,16 @@ def summary(
             filter(None, (f"The model explains the data: error {before:.2f}. {odds}", _candidate(best)))
         )
     if verdict == "unknown_effect":
-        verb = "are" if len(claimed) > 1 else "is"
-        closest = f" The closest {verb} {named}." if named else ""
-        failed = f"The model does not explain the data (error {after:.2f})"
+        closest = f" The closest {'are' if len(claimed) > 1 else 'is'} {named}." if named else ""
         how = "is supported enough to be claimed" if best[0] else "corrects this"
-        told = f"{failed}, and no effect in the library {how}.{closest}"
+        told = f"{not_explained(f'{after:.2f}', after)}, and no effect in the library {how}.{closest}"
         return " ".join(filter(None, (told, _candidate(best), reasons)))
     return "These data are not sufficient to show what is missing."
+
+
+def not_explained(told: str, error: float) -> str:
+    """That a model fails, with its error as it is `told`, which alone does not always show that."""
+    return f"The model does not explain the data ({'though its error is' if error <= _LOOKS_RIGHT else 'error'} {told})"
 
 
 def _candidate(best: tuple[str, str]) -> str:

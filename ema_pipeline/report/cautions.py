@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from enum import IntEnum
 
 from ema_pipeline.check_result import CheckResult
+from ema_pipeline.diagnose.sentences import not_explained
 from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
 from ema_pipeline.frf.channel_faults import EXCHANGED, REVERSED, SENSITIVITY
 from ema_pipeline.frf.points import POINT
@@ -146,8 +147,7 @@ def _of_fit(fit: FitResult, error: float, provisional: bool) -> Iterator[tuple[W
     if provisional:
         yield (
             Weight.MISFIT,
-            f"The model does not explain the data (error {plain(error, 3)}): "
-            "fitted values and their uncertainties are provisional",
+            f"{not_explained(plain(error, 3), error)}: fitted values and their uncertainties are provisional",
         )
     for p in fit.parameters.values():
         value = format_value(p.value, p.std, p.unit)

@@ -185,6 +185,10 @@ def test_what_is_missing_may_be_in_the_library_where_the_best_candidate_would_ex
         "claimed. The best candidate is mass at m1. Not claimed: its gain in log evidence, 3.4, is below 3.5. "
         "Parts deviate."
     )
+    scatters = sentences.summary("unknown_effect", [], (0.9, 0.9), 0.0, reasons="Damping ratios scatter.")
+    assert scatters.startswith(
+        "The model does not explain the data (though its error is 0.90), and no effect"
+    )
     without = sentences.summary("unknown_effect", [], (2.1, 2.1), 0.0)
     assert (
         without
