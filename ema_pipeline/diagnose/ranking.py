@@ -73,6 +73,7 @@ def rank(
     further: int = 0,
     unpaired: float = 0.0,
     before: Mapping[str, Posterior] | None = None,
+    reached: Sequence[Fit] = (),
 ) -> Ranking:
     """Fit every hypothesis and rank it.
 
@@ -92,6 +93,9 @@ def rank(
         all of them are doubtful.
     before : dict of str to Posterior, optional
         Fits of hypotheses to the same data with fewer unknowns, from which theirs are begun.
+    reached : sequence of Fit
+        Of the current model, with scatters learned when its last effect was added: from wide ones no path need lead
+        there.
     """
     models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
     residuals, fails = base.posterior.residuals, base.posterior.error > _EXPLAINED
@@ -104,7 +108,8 @@ def rank(
     stuck = lost or fails
 
     def settle() -> Posterior | None:
-        return None if stuck else learned(observations, base).posterior
+        bases = [] if stuck else [learned(observations, base), *reached]
+        return max((fit.posterior for fit in bases), key=lambda p: p.log_evidence, default=None)
 
     with aside(settle, processes) as settled_aside:
         promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models, processes)}
@@ -123,10 +128,9 @@ def rank(
             anew = partial(annealed_fit, observations, base, models, promise, tried, hypothesis)
         else:
             anew = partial(first_fit, observations, base, models, promise, hypothesis, near)
-        label = hypothesis.label
-        if label not in earlier:
+        if hypothesis.label not in earlier:
             return anew()
-        return continued_fit(observations, base, models[label], earlier[label], anew)
+        return continued_fit(observations, base, models[hypothesis.label], earlier[hypothesis.label], anew)
 
     short = partial(short_fits, observations, base, models, promise)
     known: dict[str, Posterior] = {}
@@ -149,18 +153,18 @@ def rank(
     if not near and not decided:
         again = _leading(found, _FIRST) if stuck else _contenders(found, _FIRST)
         base, found = _begun_again(observations, base, found, processes, again, steps=5)
-    found = _bettered(found, _contenders(found), partial(_free, observations), processes)
+    found = _bettered(found, _contenders(found), lambda fit: freed(observations, fit).posterior, processes)
     base, found = _begun_again(observations, base, found, processes, _contenders(found), steps=12)
     progress(0.8, "scatter of parts and channels")
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
     taken = {best.label for best, _ in leading(order, base)}
     others = [h for h in hypotheses if h.label not in taken]
     if settled is None:
-        ranking = finals_of(observations, base, order, (), processes, (), past_barriers=True)
+        ranking = finals_of(observations, base, order, (), processes, reached, past_barriers=True)
         return with_promising(observations, base, ranking, hypotheses, models, processes)
     straight = within_scatter(observations, settled)  # itself, but for one that is bent
     promising = promising_fits(observations, straight, others, models, further if near else 0, processes)
-    bases = [settled] if near else []
+    bases = [settled] if near else [*reached]
     narrow = narrowed(observations, settled)
     if narrow is not None:
         promising += promising_fits(observations, narrow, hypotheses, models, 0, processes)
@@ -227,8 +231,7 @@ def _begun_again(
     """The base model and some hypotheses, begun at what the best of all knows of everything else."""
     top = max((f for _, f in found.values()), key=lambda f: f.log_evidence, default=base)
     again = refined(observations, base.model, known_from(observations, base.model, top, base), steps=20)
-    if again.log_evidence > base.log_evidence:
-        base = again
+    base = max(base, again, key=lambda fit: fit.log_evidence)
     job = partial(_better, observations, (base, top), steps)
     return base, _bettered(found, contenders, job, processes)
 
@@ -252,11 +255,6 @@ def _bettered(
     return found | {h.label: (h, fit) for (h, _), fit in zip(items, better, strict=True)}
 
 
-def _free(observations: Observations, fit: Fit) -> Posterior:
-    """The fit led past barriers before which it is stuck."""
-    return freed(observations, fit).posterior
-
-
 def _better(observations: Observations, sources: Sequence[Fit], steps: int, fit: Fit) -> Posterior:
     best = fit
     for source in sources:
@@ -264,6 +262,5 @@ def _better(observations: Observations, sources: Sequence[Fit], steps: int, fit:
         if met(best.posterior, x):
             continue
         again = refined(observations, fit.model, x, steps=steps)
-        if again.log_evidence > best.log_evidence:
-            best = again
+        best = max(best, again, key=lambda f: f.log_evidence)
     return best.posterior

@@ -112,6 +112,7 @@ def select(
             settings.further_finalists,
             rounds[-1].ranking.unpaired if rounds else 0.0,
             earlier.fitted,
+            [j.ranked.fit for j in claimed[-1:]],
         )
         fitted.update({r.hypothesis.label: r.fit.posterior for r in ranking.ranked})
         asked = _beside(observations, settings, claimed)

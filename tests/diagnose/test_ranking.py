@@ -341,3 +341,23 @@ def test_a_base_model_that_is_stuck_or_bent_is_begun_again_with_all(
     # on top of one that is bent little promises anything, so that no part of it stands out first
     assert promising == ["more"] * bent
     assert stages.asked[10:] == [("promising", "bounded", ["f"], 0)] * bent
+
+
+@pytest.mark.parametrize(
+    ("error", "bent", "evidence", "known"),
+    [
+        (1.0, False, LEARNED + 1, ["reached"]),  # scores and first fits begin there as well
+        (1.0, False, LEARNED - 1, ["learned"]),
+        (1.0, True, LEARNED + 1, ["reached", "past barriers"]),
+        (1.31, False, LEARNED - 1, ["reached", "past barriers"]),
+    ],
+)
+def test_a_base_model_is_no_worse_than_the_fit_with_which_its_last_effect_was_added(
+    monkeypatch: pytest.MonkeyPatch, error: float, bent: bool, evidence: float, known: list[str]
+) -> None:
+    stages = Stages(monkeypatch, bent)
+    stages.base.posterior.error = error  # type: ignore[misc]
+    stages.base.posterior.residuals.unexplained = 0  # type: ignore[misc]
+    reached = fit("reached", evidence)
+    stages.base.model.name = "reached"  # type: ignore[attr-defined]
+    assert stages.rank(stages.base, unpaired=2.0, reached=[reached])[3] == known

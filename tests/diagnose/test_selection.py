@@ -158,6 +158,7 @@ class Steps:
         self.rounds, self.asked, self.begun, self.shares = rounds, [], [], []
         self.ranked: dict[int, tuple[Any, ...]] = {}
         self.before: list[Any] = []
+        self.reached: list[Any] = []
         self.observations: Any = SimpleNamespace(
             linearised=linearised,
             suited=lambda effects: self.observations,
@@ -183,8 +184,9 @@ class Steps:
         self.begun.append((getattr(model, "name", "base"), start))
         return SimpleNamespace(model=model, at=len(self.begun), posterior=None)
 
-    def rank(self, observations, base, left, processes, progress, further, unpaired, before) -> Any:
+    def rank(self, observations, base, left, processes, progress, further, unpaired, before, reached) -> Any:
         progress(0.5, "half")
+        self.reached.append(reached)
         self.asked.append(([h.label for h in left], unpaired))
         self.before.append(before)
         ranked = self.ranked.get(len(self.asked), ())
@@ -210,6 +212,11 @@ def test_effects_are_added_one_by_one_until_nothing_more_is_claimed(monkeypatch:
     assert steps.asked == [(["a@x", "b@y", "c@y"], 0.0), (["b@y", "c@y"], 10.0), (["c@y"], 20.0)]
     assert [name for name, _ in steps.begun] == ["base", "a@x", "b@y"]
     assert steps.begun[1][1] is a.ranked.fit
+    assert steps.reached == [
+        [],
+        [a.ranked.fit],
+        [b.ranked.fit],
+    ]  # the next base is no worse than what was claimed
     assert found.final is found.rounds[-1].ranking.base
     assert found.final.at == 3  # type: ignore[attr-defined]
     more = pytest.approx(5.5 + SETTINGS.linearised_claim)
