@@ -87,8 +87,11 @@ def standing(found: Diagnosis, candidate: Candidate) -> str:
     """What the data say of a candidate, in a word or two."""
     if candidate in alike(found):
         return "fits equally well"
-    if candidate.claimed:
-        return "best, not enough" if found.verdict == "unknown_effect" else "supported"
+    if candidate.claimed and found.verdict == "unknown_effect":
+        return "best, not enough"
+    if candidate.claimed:  # beside the first of two that are missing parts are still bent for the other one
+        raises = candidate.error_after >= candidate.error_before
+        return "supported, not alone" if raises else "supported"
     if candidate.log_evidence < candidate.threshold:
         return "not enough evidence"
     return "less likely"

@@ -223,6 +223,8 @@ def test_what_is_claimed_beside_effects_that_fit_alike_is_told_with_them() -> No
     assert [c.label for c in diagnosis.leading(both)] == [CRACK, OTHER, SUPPORT]
     words = [diagnosis.standing(both, c) for c in both.candidates]
     assert words == ["supported", "fits equally well", "fits equally well"]
+    with_another = replace(sure, claimed=True, error_after=3.2)  # its fit bends parts for the other one
+    assert diagnosis.standing(both, with_another) == "supported, not alone"
     assert diagnosis.next_commands(both, "out") == (
         f"ema add out {CRACK} {OTHER}",
         f"ema add out {CRACK} {SUPPORT}",
