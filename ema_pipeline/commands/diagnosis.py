@@ -110,14 +110,17 @@ def _change(
         stages = (shlex.join([stage, str(out), *naming(effect_files)]) for stage in AFTER_EFFECTS)
         go_on_with(f" && {program()} ".join(stages))
         # a ladder of what is only proposed would be taken for the model
-        if not quiet and (json or run.info.effects):
-            _show_ladder(run, json)
+        if not quiet and not json and run.info.effects:
+            _show_ladder(run)
         with progress(quiet) as show_stage:
             run_stages(run, AFTER_EFFECTS, show_stage)
-    if not quiet and not json:
+    if not quiet and json:
+        _show_ladder(run, json)
+    elif not quiet:
         results = load_results(run, synthesis=False)
         model, report = model_words(results.added), run.store.folder / "report.html"
-        error = "" if results.fit is None else f" (error {plain(results.fit.error, 3)})"
+        told = results.current_rung or results.fit  # as the ladder states it: the fit may bend parts further
+        error = "" if told is None else f" (error {plain(told.error, 3)})"
         show(Text(f"Fit, comparison and report now use {model}{error}."))
         show(f"Report: {report}")
 

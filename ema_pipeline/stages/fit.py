@@ -38,10 +38,12 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 
     rig = run.require_model(NAME)
     with single_blas_thread():
-        model, told = known_model(run), diagnosed_scatters(run)
+        model, ladder = known_model(run), run.store.find("ladder", ALL, "ladder", Ladder)
         observations = mode_observations(run).suited(model.effects)
-        scatters = {name: told[name] for name in observations.scatters if name in told} or None
-        ladder = run.store.find("ladder", ALL, "ladder", Ladder)
+        told = diagnosed_scatters(run) if ladder is None else {s.name: s.learned for s in ladder.scatters}
+        # an effect that was added may call for one that was not learned
+        known = {name: told.get(name, s.default) for name, s in observations.scatters.items()}
+        scatters = known if told else None
 
         def begun(effects: Sequence[str]) -> dict[str, float] | None:
             return rung_unknowns(ladder, effects) or earlier_unknowns(run, effects) or None

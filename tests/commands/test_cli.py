@@ -210,6 +210,17 @@ def test_an_effect_is_added_under_a_changed_setting_and_removed_and_the_ladder_s
     code, text, _ = ema(capsys, "ladder", out)
     assert code == 0
     assert "shaft torsion" in text
+    damper = "local_damper@sun"  # calls for a scatter that the diagnosis had no need of
+    code, text, _ = ema(capsys, "add", out, damper)
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert code == 0
+    assert f"{damper}.coefficient" in summary["fit"]["parameters"]
+    told = re.search(r"\(error ([\d.]+)\)", " ".join(text.split()))
+    assert told is not None
+    assert float(told[1]) == pytest.approx(summary["ladder"][2]["error"], rel=0.01)
+    code, text, _ = ema(capsys, "remove", out, damper, "--json")
+    assert code == 0
+    assert [rung["effects"] for rung in json.loads(text)["ladder"]] == [[], [effect]]
     code, text, _ = ema(capsys, "remove", out, effect)
     assert code == 0
     report = re.escape(str(out / "report.html"))
