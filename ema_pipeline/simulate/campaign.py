@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -79,8 +80,8 @@ def simulate_campaign(
     Parameters
     ----------
     out : Path
-        Folder to write; it may exist but must hold no test.toml. Several configurations become its
-        sub-folders. ``truth.json`` in it says what was simulated.
+        Folder to write; it may exist but must hold no test.toml, and no file that would be replaced. Several
+        configurations become its sub-folders. ``truth.json`` in it says what was simulated.
     rig : Rig, str or Path
         A rig, a shipped rig's name or a rig file (copied beside the data as ``rig.toml``).
     configurations : sequence of str
@@ -106,11 +107,14 @@ def simulate_campaign(
     Raises
     ------
     EmaError
-        For unknown names, a folder that already holds data, and settings out of range.
+        For unknown names, a folder that already holds data, settings out of range, and a model that cannot be
+        solved; nothing is written then.
     """
     out = Path(out)
     options = parse(SimulationSettings, settings, "simulate")
     _check_times(options)
+    if out.exists() and not out.is_dir():
+        raise EmaError(f"{out}: is no folder; name another")
     if any(out.glob("test.toml")) or any(out.glob("*/test.toml")):
         raise EmaError(f"{out}: holds a test already; name another folder or delete it")
     base = rig if not isinstance(rig, str | Path) else load_rig(rig)
@@ -120,28 +124,43 @@ def simulate_campaign(
     of_values = random if options.rig_seed is None else np.random.default_rng(options.rig_seed)
     true = true_values(made.rig, values or {}, options.scatter, of_values)
     _check_bad_hits(options, chosen)
-
     _check_dofs(base, chosen, sensors, impacts)
-    own_rig = isinstance(rig, str | Path) and str(rig) not in rig_names()
-    rig_name = "" if own_rig else base.name
-    tests = _tests(out, base, rig_name, chosen, sensors, impacts, options)
-    out.mkdir(parents=True, exist_ok=True)
-    if own_rig:
-        shutil.copyfile(str(rig), out / "rig.toml")
-    with single_blas_thread():
-        written = _write(tests, made, true, options, respond, random)
+    own_file = Path(rig) if isinstance(rig, str | Path) and str(rig) not in rig_names() else None
+    tests = _tests(base, base.name if own_file is None else "", chosen, sensors, impacts, options)
+    _check_points_of_bad_hits(options, tests)
     truth: dict[str, Any] = {
         "rig": base.name,
         "effects": list(effects),
         "values": true,
         "settings": options.model_dump(mode="json"),
-        "configurations": written,
     }
-    if not options.imperfections.none:
-        truth["imperfections"] = _drawn(made, tests, options)
-    (out / TRUTH_FILE).write_text(json.dumps(truth, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(
+        prefix=".simulated-", dir=out if out.is_dir() else out.parent
+    ) as scratch:
+        made_in = Path(scratch)
+        if own_file is not None and own_file.resolve() != (out / "rig.toml").resolve():
+            shutil.copyfile(own_file, made_in / "rig.toml")
+        with single_blas_thread():
+            truth["configurations"] = written = _write(made_in, tests, made, true, options, respond, random)
+        if not options.imperfections.none:
+            truth["imperfections"] = _drawn(made, tests, options)
+        text = json.dumps(truth, indent=1, ensure_ascii=False)
+        (made_in / TRUTH_FILE).write_text(text + "\n", encoding="utf-8")
+        _moved(made_in, out)
     records = sum(len(c["records"]) for c in written.values())
     return SimulatedCampaign(out, tuple(chosen), true, records, _assumed(made.rig, effects, values or {}))
+
+
+def _moved(made_in: Path, out: Path) -> None:
+    """Move all files to a folder, unless one of them would replace another."""
+    files = sorted(path.relative_to(made_in) for path in made_in.rglob("*") if path.is_file())
+    for file in files:
+        if (out / file).exists():
+            raise EmaError(f"{out / file}: would be replaced; name another folder or delete it")
+    for file in files:
+        (out / file).parent.mkdir(parents=True, exist_ok=True)
+        (made_in / file).replace(out / file)
 
 
 def _assumed(rig: Rig, effects: Sequence[str], values: Mapping[str, float]) -> dict[str, str]:
@@ -197,7 +216,6 @@ def default_impacts(sensors: tuple[Dof, ...]) -> tuple[Dof, ...]:
 
 
 def _tests(
-    out: Path,
     base: Rig,
     rig_key: str,
     configurations: Sequence[str],
@@ -208,7 +226,7 @@ def _tests(
     """The test of each configuration, all with the same sensors."""
     tests = []
     for configuration in configurations:
-        folder = out / configuration if len(configurations) > 1 else out
+        folder = Path(configuration if len(configurations) > 1 else "")
         places = _sensors_of(base, configuration, sensors)
         points = _places(impacts, base.assembly(configuration)) or default_impacts(places)
         tests.append(TestFolder(base.name, rig_key, configuration, folder, places, points, options))
@@ -225,6 +243,7 @@ def _sensors_of(base: Rig, configuration: str, sensors: Sequence[str]) -> tuple[
 
 
 def _write(
+    out: Path,
     tests: Sequence[TestFolder],
     made: TrueRig,
     true: Mapping[str, float],
@@ -236,7 +255,7 @@ def _write(
     sizes = options.imperfections
     respond = respond or (response if sizes.none else response_by_poles)
     written = {}
-    for test in tests:
+    for test in (replace(t, folder=out / t.folder) for t in tests):
         test.folder.mkdir(exist_ok=True)
         number = made.rig.configurations.index(test.configuration)
         series = HitSeries(sizes, options.drift_kind, generator(options.seed, "hits", number))
@@ -326,3 +345,14 @@ def _check_bad_hits(options: SimulationSettings, configurations: Sequence[str]) 
             _known([match["configuration"]], configurations, "configuration")
         if not 1 <= int(match["number"]) <= options.hits:
             raise EmaError(f"hit '{text}': there are {options.hits} hits per point, numbered from 1")
+
+
+def _check_points_of_bad_hits(options: SimulationSettings, tests: Sequence[TestFolder]) -> None:
+    """EmaError for a hit on a point that no test strikes."""
+    for text in (*options.double_hits, *options.overloads):
+        match = BAD_HIT.match(text)
+        assert match is not None
+        asked = [t for t in tests if match["configuration"] in (None, t.configuration)]
+        struck = dict.fromkeys(str(dof) for t in asked for dof in t.impacts)
+        if match["dof"] not in struck:
+            raise EmaError(f"hit '{text}': no hit is on {match['dof']}; they are on {', '.join(struck)}")

@@ -48,6 +48,7 @@ class TestFolder:
         What test.toml says of the rig; empty where a rig.toml lies beside it.
     configuration : str
     folder : Path
+        Relative to the campaign's until it is written.
     sensors, impacts : tuple of Dof
     options : SimulationSettings
     channels : dict of str to ChannelDraw
@@ -169,8 +170,9 @@ class TestFolder:
         for text in hits:
             match = BAD_HIT.match(text)
             assert match is not None  # checked at the start
-            if match["dof"] == str(impact) and int(match["number"]) == number:
-                return match["configuration"] in (None, self.configuration)
+            here = match["configuration"] in (None, self.configuration)
+            if here and match["dof"] == str(impact) and int(match["number"]) == number:
+                return True
         return False
 
     def _channel_names(self) -> tuple[str, ...]:

@@ -71,6 +71,15 @@ class SimulationSettings(Settings):
         "tests with one rig_seed and different seeds are of one rig with one set of sensors",
     )
 
+    @field_validator("peak_force_n")
+    @classmethod
+    def _levels_apart(cls, levels: tuple[float, ...]) -> tuple[float, ...]:
+        """Records are named by their level."""
+        named = [f"{level:g}" for level in levels]
+        if min(levels) <= 0 or len(set(named)) < len(named):
+            raise ValueError(f"levels have to be above 0 N, and each another one: {', '.join(named)}")
+        return levels
+
     @field_validator("peak_force_n", "double_hits", "overloads", mode="before")
     @classmethod
     def _one_or_several(cls, given: object) -> object:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from itertools import pairwise
 from pathlib import Path
@@ -312,6 +313,13 @@ def test_rig_file_travels_with_the_data(tmp_path: Path) -> None:
         ({"sensors": ["sun.x", "-sun.x"]}, "sensor 'sun.x' is named twice"),
         ({"impacts": ["sun.x", "sun.x"]}, "impact 'sun.x' is named twice"),
         ({"effects": ["sensor_mass@all:mass=1,mass=2"]}, "'mass' is given twice"),
+        ({"peak_force_n": [150, 150.0000001]}, "above 0 N, and each another one: 150, 150"),
+        ({"peak_force_n": [0.0]}, "above 0 N, and each another one: 0"),
+        (
+            {"impacts": ["sun.x"], "overloads": ["sun.y#1"]},
+            "hit 'sun.y#1': no hit is on sun.y; they are on sun.x",
+        ),
+        ({"effects": ["spring@sun.x:stiffness=-1e9"]}, "stiffness is negative around 'sun.x'"),
         ({"duration_s": 1e9}, "make 5.12e\\+12 samples per hit, 1e\\+07 at most; lower one of them"),
     ],
 )
@@ -325,6 +333,30 @@ def test_a_folder_that_holds_a_test_is_not_written_over(tmp_path: Path) -> None:
     simulate_campaign(tmp_path / "raw", "frame", duration_s=0.2, hits=1)
     with pytest.raises(EmaError, match="holds a test already"):
         simulate_campaign(tmp_path / "raw", "frame", duration_s=0.2, hits=1)
+
+
+@pytest.mark.parametrize("name", ["truth.json", "rig.toml", "{record}"])
+def test_no_file_is_replaced_and_none_is_left_where_one_would_be(tmp_path: Path, name: str) -> None:
+    rig = tmp_path / "mine.toml"
+    rig.write_text('base = "frame"\n', encoding="utf-8")
+    simulate_campaign(tmp_path / "first", rig, duration_s=0.2, hits=1)
+    record = next(path.name for path in (tmp_path / "first").iterdir() if path.suffix == ".uff")
+    raw = tmp_path / "raw"
+    raw.mkdir()
+    mine = raw / name.format(record=record)
+    mine.write_text("mine", encoding="utf-8")
+    with pytest.raises(EmaError, match=rf"{re.escape(str(mine))}: would be replaced; name another folder"):
+        simulate_campaign(raw, rig, duration_s=0.2, hits=1)
+    assert [path.name for path in raw.iterdir()] == [mine.name]
+    assert mine.read_text(encoding="utf-8") == "mine"
+
+
+def test_a_rig_file_that_lies_in_the_folder_already_stays(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.toml"
+    rig.write_text('base = "frame"\n', encoding="utf-8")
+    simulate_campaign(tmp_path, rig, duration_s=0.2, hits=1)
+    assert rig.read_text(encoding="utf-8") == 'base = "frame"\n'
+    assert (tmp_path / "test.toml").is_file()
 
 
 SAMPLES = Path(__file__).parents[2] / "sample_data"
