@@ -8,7 +8,7 @@ import io
 import os
 import sys
 import traceback
-from typing import Annotated, NoReturn
+from typing import Annotated, NoReturn, TextIO
 
 import typer
 
@@ -56,11 +56,15 @@ _DISK_IS_FULL = {errno.ENOSPC, errno.EDQUOT}
 def main() -> None:
     """Entry point: every problem with data or settings is one line on stderr and exit code 1."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # see ema_pipeline.threads
+    if os.environ.get("COLUMNS") == "0":  # the width is not known
+        del os.environ["COLUMNS"]
+    sys.stdout, sys.stderr = _opened(sys.stdout), _opened(sys.stderr)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a character gets its escape
             stream.reconfigure(errors="backslashreplace")
     try:
         answer_ctrl_c(program())
+        _refuse_lost_folder()
         _refuse_empty(sys.argv[1:])
         app()
     except EmaError as error:
@@ -81,6 +85,18 @@ def main() -> None:
             _stop_for_crash(error)
         where = f"{refused.filename}: " if refused.filename else ""
         _stop(f"ema: {where}{reason(refused)}; check the disk's free space and the folder's rights", 1)
+
+
+def _opened(stream: TextIO | None) -> TextIO:
+    """A standard stream, or one to nowhere where it was closed before the program began, as by a daemon."""
+    return open(os.devnull, "w", encoding="utf-8") if stream is None else stream
+
+
+def _refuse_lost_folder() -> None:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise EmaError("the current folder was deleted: change to one that exists") from None
 
 
 def _refuse_empty(arguments: list[str]) -> None:

@@ -149,7 +149,7 @@ def _solve(
     names = ", ".join(e.name for e in elements)
     raise EmaError(
         f"no solution at step {number} of {time_step:.3g} s with {names}: the motion grows without bound, "
-        "or the step is too long; check the elements' values, or give more substeps"
+        "or the step is too long; check the elements' values, or raise the sample rate"
     )
 
 

@@ -77,7 +77,7 @@ def response_from_rest(
     if found.failed:
         raise EmaError(
             f"no solution with {', '.join(e.name for e in elements)}: the motion grows without bound, or the step of "
-            f"{step:.3g} s is too long; check the elements' values, or give more substeps"
+            f"{step:.3g} s is too long; check the elements' values, or raise the sample rate"
         )
     motion = found.motion[0].T + direct[:, :1] * force
     return TimeResponse(*motion.reshape(3, len(out_rows), -1))

@@ -40,6 +40,8 @@ _MOST_RECORDS = 4
 """Records whose errors a screen has room for."""
 
 _MODEL_HZ = "model, Hz"
+_GIVE_WAY = (_MODEL_HZ, "MPC", "MAC", "difference, %", "damping, %")
+"""Columns that a narrow terminal does without, one after the other."""
 
 _MOST_NAMED = 4
 """Candidates left out that a line has room for."""
@@ -89,13 +91,15 @@ class RunScreen:
 
 
 def _fitted(table: Table, clean: Clean, console: Console, options: ConsoleOptions) -> RenderableType:
-    """The table of modes; without the model's frequencies, which the differences tell, where that is too wide."""
-    built = build_table(table, "", clean, ruled=False)
-    needed = Measurement.get(console, options.update(max_width=10_000), built).maximum
-    if needed <= options.max_width or _MODEL_HZ not in table.head:
-        return built
-    left = [k for k, name in enumerate(table.head) if name != _MODEL_HZ]
-    return build_table(table.picked(left), "", clean, ruled=False)
+    """The table of modes without the columns that it is too wide for: first the model's frequencies, which the
+    differences tell.
+    """
+    for name in ("", *_GIVE_WAY):
+        table = table.picked([k for k, head in enumerate(table.head) if not name or head != name])
+        built = build_table(table, "", clean, ruled=False)
+        if Measurement.get(console, options.update(max_width=10_000), built).maximum <= options.max_width:
+            break
+    return built
 
 
 def _fitting(blocks: Sequence[list[str]], room: int) -> list[list[str]]:

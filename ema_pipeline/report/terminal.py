@@ -324,8 +324,18 @@ def _renamed(source: tables.Table, head: tuple[str, ...]) -> tables.Table:
 
 
 def text_table(source: tables.Table, title: str) -> Safe:
-    """A table for the terminal, or for any other place with letters of one width."""
-    return Safe(lambda clean, width: build_table(source, title, clean, width))
+    """A table for the terminal, or for any other place with letters of one width.
+
+    Where numbers would have to be broken, some columns stand below the others.
+    """
+
+    def made(clean: Clean, width: int) -> RenderableType:
+        kept = _kept(source)
+        if _widths(source, kept, clean, width) is None:
+            return Group(*_blocks(source.picked(kept), title, clean, width))
+        return build_table(source, title, clean, width)
+
+    return Safe(made)
 
 
 def matrix_table(source: tables.Table, title: str) -> Safe:
@@ -346,8 +356,9 @@ def _blocks(source: tables.Table, title: str, clean: Clean, width: int) -> Itera
         block.append(k)
         if k < last and sum(needed[n] for n in (*block, k + 1)) <= room:
             continue
-        part = f", columns {block[0]} to {k} of {last}" if len(block) < last else ""
-        yield Text(clean(title + part), style="bold")
+        columns = f"columns {block[0]} to {k}" if len(block) > 1 else f"column {k}"
+        part = f", {columns} of {last}" if len(block) < last else ""
+        yield Text(clean((title + part).removeprefix(", ")), style="bold")
         yield build_table(source.picked((0, *block)), "", clean, width)
         yield Text("")
         block = []
@@ -361,9 +372,8 @@ def build_table(
     Within `width` numbers and values are never broken over lines; where that does not fit, they are broken at their
     blanks rather than lose a digit. Without it every cell stays on its lines.
     """
-    # a column of remarks that nobody made is only noise
-    kept = [k for k in range(len(source.head)) if not source.rows or any(r.cells[k] for r in source.rows)]
-    widths = None if width is None else _widths(source, kept, clean, width - 1 - 2 * len(kept))
+    kept = _kept(source)
+    widths = None if width is None else _widths(source, kept, clean, width)
     table = RichTable(
         title=Text(clean(title), style="bold") if title else None,
         title_justify="left",
@@ -388,8 +398,14 @@ def build_table(
     return table
 
 
-def _widths(source: tables.Table, kept: Sequence[int], clean: Clean, room: int) -> list[int] | None:
-    """Widths of columns that fill no more than the room; None where words would have to be broken."""
+def _kept(source: tables.Table) -> list[int]:
+    """Columns without those of remarks that nobody made, which are only noise."""
+    return [k for k in range(len(source.head)) if not source.rows or any(r.cells[k] for r in source.rows)]
+
+
+def _widths(source: tables.Table, kept: Sequence[int], clean: Clean, width: int) -> list[int] | None:
+    """Widths of columns that fill no more than a width; None where words would have to be broken."""
+    room = width - 1 - 2 * len(kept)
     most, least, loose = [], [], []
     for k in kept:
         cells = [line for r in source.rows for line in clean(r.cells[k]).splitlines()]

@@ -393,6 +393,27 @@ def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert out.startswith("ema 0.")
 
 
+def test_streams_that_a_daemon_has_closed_are_no_fault(tmp_path: Path) -> None:
+    code = (
+        "import os, sys; os.close(1); os.close(2); sys.stdout = sys.stderr = None;"
+        "from ema_pipeline.cli import main; sys.argv = ['ema', 'simulate', 'raw', '--rig', 'frame']; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False)
+    assert done.returncode == 0
+    assert (tmp_path / "raw" / "test.toml").is_file()
+
+
+def test_a_current_folder_that_was_deleted_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lost = tmp_path / "lost"
+    lost.mkdir()
+    monkeypatch.chdir(lost)
+    lost.rmdir()
+    code, _, err = ema(capsys, "rigs")
+    assert (code, err) == (1, "ema: the current folder was deleted: change to one that exists\n")
+
+
 def test_an_empty_path_is_refused_and_nothing_is_written_to_the_current_folder(
     small_raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

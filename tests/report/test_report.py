@@ -532,6 +532,17 @@ def _printed(renderable: object, width: int, encoding: str = "utf-8") -> str:
     return file.buffer.getvalue().decode(encoding)
 
 
+@pytest.mark.parametrize("width", [40, 28])
+def test_no_number_is_broken_on_a_narrow_terminal(run: RunResults, width: int) -> None:
+    assert run.configurations[0].modal is not None
+    modes = run.configurations[0].modal.modes
+    told = _printed(terminal.modes_table(run.configurations[0].modal), width)
+    for mode in modes:
+        assert format_value(mode.frequency_hz, mode.frequency_std_hz) in told
+    assert max(map(len, told.splitlines())) <= width
+    assert "column" in told  # some stand below the others
+
+
 def test_comparison_says_that_its_error_is_that_of_the_fit(run: RunResults) -> None:
     assert run.comparison is not None
     told = " ".join(_printed(terminal.comparison_tables(run.comparison), 80).split())
