@@ -85,8 +85,10 @@ def excluding(hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Change:
         choices = run.info.choices
         for text in hits:
             hit = _hit(run, text)
-            if hit in choices.excluded_hits:
+            if hit in run.info.choices.excluded_hits:
                 raise EmaError(f"hit '{hit}' is excluded already")
+            if hit in choices.excluded_hits:
+                raise EmaError(f"hit '{hit}' is named twice; name it once")
             choices = dataclasses.replace(choices, excluded_hits=(*choices.excluded_hits, hit))
             _require_others(run, choices, hit)
         for text in modes:
@@ -97,8 +99,10 @@ def excluding(hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Change:
                 choices = dataclasses.replace(choices, included_modes=left)
                 continue
             choice = _mode(run, configuration, frequency)
-            if choice in choices.excluded_modes:
+            if choice in run.info.choices.excluded_modes:
                 raise EmaError(f"mode '{choice}' is excluded already")
+            if choice in choices.excluded_modes:
+                raise EmaError(f"mode '{choice}' is named twice; name it once")
             choices = dataclasses.replace(choices, excluded_modes=(*choices.excluded_modes, choice))
         _require_modes(run, choices)
         return choices

@@ -83,7 +83,11 @@ def frequencies(out: Path) -> list[float]:
 def test_an_excluded_hit_stays_out_until_it_is_taken_back(tested: Path, out: Path) -> None:
     before = results(out)
     hit = before.configurations[0].hits[0]
+    with pytest.raises(EmaError, match="is named twice"):
+        change_choices(out, excluding(hits=[hit.file, hit.file]))
     change_choices(out, excluding(hits=[hit.file]))
+    with pytest.raises(EmaError, match="is excluded already"):
+        change_choices(out, excluding(hits=[hit.file]))
     after = results(out)
     assert [h.accepted for h in after.configurations[0].hits] == [
         h is not hit for h in before.configurations[0].hits
@@ -158,6 +162,8 @@ def test_results_whose_fit_failed_have_no_pairs_of_modes_that_are_gone(out: Path
 def test_an_excluded_mode_is_not_compared_and_the_others_stay(out: Path) -> None:
     before = results(out)
     all_hz = frequencies(out)
+    with pytest.raises(EmaError, match="is named twice"):
+        change_choices(out, excluding(modes=[f"{all_hz[1]:.1f}"] * 2))
     change_choices(out, excluding(modes=[f"{all_hz[1]:.1f}"]))
     after = results(out)
     found = after.configurations[0]
