@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED, DiagnoseSettings
 from ema_pipeline.inference import Posterior, beyond
+from ema_pipeline.inference.bounded import FURTHEST
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, at_scatters, part_reach, within_scatter
+from ema_pipeline.observations.fitting import PARTS, Fit, at_scatters, part_reach, within_scatter
 from ema_pipeline.observations.hit_residuals import LINEARISATION
 from ema_pipeline.observations.mode_problem import MIXING
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, SHAPE
@@ -147,7 +148,7 @@ def at_usual_scatters(observations: Observations, fit: Fit, of: Sequence[str] = 
 
 def with_usual_scatters(observations: Observations, fit: Fit) -> Fit:
     """The fit with neither frequencies, shapes nor damping ratios further from the model's than usual."""
-    return at_usual_scatters(observations, fit, (*_OF_TESTS, DAMPING_SCATTER))
+    return at_usual_scatters(observations, fit, (*_OF_TESTS, DAMPING_SCATTER, JOINT_DAMPING))
 
 
 def fails_at_usual_scatters(observations: Observations, fit: Fit, settings: DiagnoseSettings) -> bool:
@@ -177,7 +178,7 @@ def outlying_damping(observations: Observations, fit: Fit) -> OutlyingDamping | 
 def _usual_scatter(observations: Observations, name: str) -> float:
     """The largest value of a scatter that is usual."""
     default = observations.scatters[name].default
-    return max(default, _USUAL_DAMPING_SCATTER) if name == DAMPING_SCATTER else default
+    return max(default, _USUAL_DAMPING_SCATTER) if name in (DAMPING_SCATTER, JOINT_DAMPING) else default
 
 
 def _squares_of_ratios(p: Posterior, usual: float) -> NDArray[np.float64]:
@@ -203,9 +204,10 @@ def _squares_of_own_damping(p: Posterior, usual: float) -> NDArray[np.float64]:
 
 
 def outlying_parts(observations: Observations, fit: Fit) -> tuple[OutlyingPart, ...]:
-    """Every part that lies further out than parts scatter, furthest first."""
+    """Every part, and every joint's damping, that lies further out than its like scatter, furthest first."""
     p = fit.posterior
-    one_sigma = part_reach(observations, p, furthest=1.0)
-    names = [p.unknowns.names[i] for i in np.flatnonzero(beyond(p, part_reach(observations, p)))]
+    one_sigma = part_reach(observations, p, 1.0, (*PARTS, JOINT_DAMPING))
+    most = {name: FURTHEST * reach for name, reach in one_sigma.items()}
+    names = [p.unknowns.names[i] for i in np.flatnonzero(beyond(p, most))]
     found = [OutlyingPart(n, float(np.expm1(p.value(n))), one_sigma[n]) for n in names]
     return tuple(sorted(found, key=lambda part: -abs(part.deviation) / part.others))

@@ -279,9 +279,11 @@ def averaged(observations: Observations, fit: Fit) -> Fit:
     return replace(wide, posterior=averaged_over_others(bounded, wide.posterior, problem.sizes))
 
 
-def part_reach(observations: Observations, found: Posterior, furthest: float = FURTHEST) -> dict[str, float]:
+def part_reach(
+    observations: Observations, found: Posterior, furthest: float = FURTHEST, kinds: Sequence[str] = PARTS
+) -> dict[str, float]:
     """How far every part may deviate from its like, by name, see `reach`."""
-    known = {n: observations.scatters[n].default for n in PARTS if n in observations.scatters}
+    known = {n: observations.scatters[n].default for n in kinds if n in observations.scatters}
     return reach(found, known, furthest)
 
 
