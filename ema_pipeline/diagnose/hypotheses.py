@@ -157,7 +157,7 @@ def _names(
             assembly = next(a for a in assemblies.values() if effect.fits(a, place))
             (generic if effect.generic else own).append(Name(*PlacedEffect(effect, place).hosted(assembly)))
     for parameter in rig.parameters.values():
-        known = parameter.tolerance > 0 and not parameter.free and parameter.value != 0
+        known = not parameter.free and parameter.value != 0  # also where no tolerance is stated
         if known and proportional_elements(rig, parameter.name):
             own.append(Name(tolerance_effect(rig, parameter.name), {}))
     return own + generic

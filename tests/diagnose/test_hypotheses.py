@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -102,6 +103,40 @@ def test_parameters_that_are_known_may_be_out_of_tolerance_and_free_ones_may_not
     assert "out_of_tolerance@sun_bearing_stiffness" in of_planetary()
     assert "out_of_tolerance@sun_planet_mesh_stiffness" not in of_planetary()
     assert "out_of_tolerance@pressure_angle_deg" not in of_planetary()
+
+
+def test_a_strut_whose_tolerance_is_not_stated_may_be_off_as_well(tmp_path: Path) -> None:
+    """No generic spring lies along an oblique one."""
+    file = tmp_path / "rig.toml"
+    file.write_text(
+        """name = "strut"
+[parameters]
+k1 = 1e5
+[[masses]]
+at = "m1.x"
+value = 1.0
+[[masses]]
+at = "m1.y"
+value = 1.0
+[[springs]]
+name = "k1"
+value = "k1"
+row = { "m1.x" = 0.6, "m1.y" = 0.8 }
+[[springs]]
+at = "m1.x"
+value = 1e5
+[[springs]]
+at = "m1.y"
+value = 2e5
+""",
+        encoding="utf-8",
+    )
+    known = by_name(load_rig(file))
+    assert known["out_of_tolerance@k1"] not in [
+        known["spring@m1"],
+        known["spring@m1.x"],
+        known["spring@m1.y"],
+    ]
 
 
 def test_effects_that_the_model_has_and_those_that_depend_on_the_level_are_left_out() -> None:
