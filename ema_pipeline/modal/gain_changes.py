@@ -154,6 +154,9 @@ class _PeakFit:
 def gain_changes(frfs: FrfSet, found: Sequence[PlainResidues]) -> GainChanges | None:
     """Sensors whose gain differs between points of impact; None unless three peaks or more can show it, and do.
 
+    Where sensors rove, only reversed ones are looked for: what they read also differs with the mean direction of the
+    hits in their turn, by another factor in every mode, and at points that two of them take by their gains.
+
     Forward selection: a factor enters where an F-test on all peaks leaves less than `FALSE_ALARM` to chance, over all
     FRFs; the first one without the peak that speaks for it most. Weights of peaks come from a fit of all factors at
     once, so that a peak that no low rank describes has no say.
@@ -168,6 +171,10 @@ def gain_changes(frfs: FrfSet, found: Sequence[PlainResidues]) -> GainChanges | 
     if min(frfs.hits.shape) < 2 or frfs.hits.size > MOST_CELLS or len(found) < FEWEST_PEAKS:
         return None
     signs = signs_of(found)
+    if _rove(frfs.hits):
+        return (
+            None if np.all(signs > 0) else GainChanges(frfs.outputs, frfs.inputs, signs.T.astype(float), 0.0)
+        )
     peaks = [_Peak(p.residues, p.variance, first_right(p.residues, 1)) for p in upright(found, signs)]
     cells, logarithms, covariance = _selected(*_weighed(peaks))
     if not cells and np.all(signs > 0):
@@ -181,6 +188,12 @@ def gain_changes(frfs: FrfSet, found: Sequence[PlainResidues]) -> GainChanges | 
     std = np.sqrt(np.max(np.sum((full @ covariance) * full, axis=1)))
     factors = signs * np.exp(full @ logarithms).reshape(n_inputs, n_outputs)
     return GainChanges(frfs.outputs, frfs.inputs, factors.T, float(std))
+
+
+def _rove(hits: NDArray[np.int64]) -> bool:
+    """True where a sensor took part in twice as many hits on a point as another one, (n_outputs, n_inputs)."""
+    fewest = np.min(np.where(hits > 0, hits, np.iinfo(hits.dtype).max), axis=0)
+    return bool(np.any(hits.max(axis=0) >= 2 * fewest.astype(float)))
 
 
 def _weighed(peaks: list[_Peak]) -> tuple[list[_Peak], Real]:

@@ -110,6 +110,21 @@ def test_close_modes_are_not_taken_for_changes() -> None:
     assert len(identified(hits_of(constant(), close)).modal.modes) == 6
 
 
+def test_sensors_that_rove_have_no_gain_that_changed_but_may_be_reversed() -> None:
+    gains = constant()
+    gains[1, 2] = 1.3
+    frfs = estimate_frfs(hits_of(gains))
+    hits = frfs.hits.copy()
+    hits[0] *= 2  # the sensor that stays takes part in every turn
+    roving = replace(frfs, hits=hits)
+    assert gain_changes(roving, plain_residues(roving, BAND)) is None
+    gains[1, 2] = -1.0
+    reversed_once = replace(estimate_frfs(hits_of(gains)), hits=hits)
+    changes = gain_changes(reversed_once, plain_residues(reversed_once, BAND))
+    assert changes is not None
+    assert np.flatnonzero(changes.factors != 1).tolist() == [1 * len(INPUTS) + 2]
+
+
 def test_two_peaks_and_one_point_cannot_show_it() -> None:
     gains = constant()
     gains[1, 2] = 0.9
