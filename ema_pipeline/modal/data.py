@@ -46,7 +46,7 @@ class FitData:
     window_rad_s : float
         Decay rate of the exponential window under which all was measured, noise too; 0 for none.
     in_turn : bool
-        True where a sensor was moved from DOF to DOF, and several points were struck each time.
+        True where a sensor was moved from DOF to DOF: the hits of every turn have a mean direction of their own.
     cut_s : float, optional
         Mean time before the hit in records that end while the responses ring; None where they have decayed.
     """
@@ -151,7 +151,7 @@ def arrange(frfs: FrfSet, band_hz: tuple[float, float]) -> FitData:
     transposed = acc.shape[0] < acc.shape[1]
     if transposed:
         acc, variance, measured = acc.swapaxes(0, 1), variance.swapaxes(0, 1), measured.T
-    in_turn = len(frfs.inputs) > 1 and bool(moved_sensors(frfs))
+    in_turn = bool(moved_sensors(frfs))
     return FitData(
         omega, acc, variance, measured, frfs.rest_s, transposed, frfs.response_decay_rad_s, in_turn,
         float(np.nanmean(frfs.delay_s)) if frfs.rings_on else None,

@@ -267,7 +267,7 @@ def own_share(data: FitData, estimate: Estimate, noise: Noise) -> Real:
     """Share of the variance of every row's shape entries that the row does not have in common with others.
 
     What all outputs of one hit share changes the scale of a shape, and not its form. Rows that are struck points share
-    nothing: each has hits of its own.
+    nothing: each has hits of its own; nor do those of sensors that are moved, whose turns are of different hits.
 
     Parameters
     ----------
@@ -279,7 +279,7 @@ def own_share(data: FitData, estimate: Estimate, noise: Noise) -> Real:
     ndarray, (n_rows, M)
     """
     m = len(estimate.poles)
-    if data.transposed:
+    if data.transposed or data.in_turn:
         return np.ones((len(data.frf), m))
     power = np.abs(1 / (1j * data.omega - estimate.poles[:, None])) ** 2
     weight = noise.weight(data.measured)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import f as variance_ratio
 
 from ema_pipeline.dof import Dof
+from ema_pipeline.frf.channels import moved_sensors
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.low_rank import first_right, low_rank, tangent
 from ema_pipeline.modal.plain_residues import FALSE_ALARM, FEWEST_PEAKS, PlainResidues
@@ -171,7 +172,7 @@ def gain_changes(frfs: FrfSet, found: Sequence[PlainResidues]) -> GainChanges | 
     if min(frfs.hits.shape) < 2 or frfs.hits.size > MOST_CELLS or len(found) < FEWEST_PEAKS:
         return None
     signs = signs_of(found)
-    if _rove(frfs.hits):
+    if moved_sensors(frfs):
         return (
             None if np.all(signs > 0) else GainChanges(frfs.outputs, frfs.inputs, signs.T.astype(float), 0.0)
         )
@@ -188,12 +189,6 @@ def gain_changes(frfs: FrfSet, found: Sequence[PlainResidues]) -> GainChanges | 
     std = np.sqrt(np.max(np.sum((full @ covariance) * full, axis=1)))
     factors = signs * np.exp(full @ logarithms).reshape(n_inputs, n_outputs)
     return GainChanges(frfs.outputs, frfs.inputs, factors.T, float(std))
-
-
-def _rove(hits: NDArray[np.int64]) -> bool:
-    """True where a sensor took part in twice as many hits on a point as another one, (n_outputs, n_inputs)."""
-    fewest = np.min(np.where(hits > 0, hits, np.iinfo(hits.dtype).max), axis=0)
-    return bool(np.any(hits.max(axis=0) >= 2 * fewest.astype(float)))
 
 
 def _weighed(peaks: list[_Peak]) -> tuple[list[_Peak], Real]:

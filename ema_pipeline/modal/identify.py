@@ -30,6 +30,7 @@ from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.scaling import scale_shapes, scaling_note
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.sub_bands import candidates, first_guess, refined, tracked, whole
+from ema_pipeline.modal.turns import spread_of_turns
 from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
 from ema_pipeline.processes import release_memory
 from ema_pipeline.threads import in_order, single_blas_thread
@@ -201,6 +202,7 @@ def _model(
         modes.participation_stds[order],
         calibrated=frfs.force_calibrated,
     )
+    by_turns = spread_of_turns(frfs, scaled.dofs, scaled.shapes)
     note = scaling_note(any(d in rows for d in references), frfs.force_calibrated)
     chart, stability = _chart(charts, modes.poles[order], frfs.response_decay_rad_s)
     result = tuple(
@@ -208,8 +210,8 @@ def _model(
             complex(physical[j]),
             pole_cov[j],
             scaled.shapes[k],
-            scaled.stds[k],
-            scaled.own_stds[k],
+            np.hypot(scaled.stds[k], by_turns[k]),
+            np.hypot(scaled.own_stds[k], by_turns[k]),
             settings.engine,
             float(stability[k]),
             float(scaled.scale_std[k]),

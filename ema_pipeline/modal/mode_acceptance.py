@@ -72,6 +72,10 @@ that is some degrees off its direction excites another mix, so that the residue 
 value. At 8°, with hits on frames, second poles reached 0.13 of the first and distances up to 0.6; two modes of such
 poles are not told apart."""
 
+TURNED_RANK, TURNED_REACH = 0.55, 0.2
+"""The same of poles that nearly coincide: with one hit per turn, and a mode that moves the points struck mostly across
+the blows, second poles reached 0.5 of the first, at distances up to 0.16."""
+
 SAME_RESPONSE = 0.9
 """MAC at three or more sensors that measured together, above which two coinciding poles are one mode where a
 misfit is left over: its frequency drifts between hits, which splits it in two that look alike."""
@@ -269,8 +273,9 @@ def _doubles(
     distance = np.abs(estimate.poles[:, None] - estimate.poles[None])
     heavier = _heavier(estimate.poles)
     close = distance < COINCIDENT * heavier
-    if data.in_turn:
-        near, least = distance < MIXED_REACH * heavier, np.full((len(decay), 1), MIXED_RANK)
+    if data.in_turn and min(data.measured.shape) > 1:
+        near = distance < MIXED_REACH * heavier
+        least = np.where(distance < TURNED_REACH * heavier, TURNED_RANK, MIXED_RANK)
     else:
         near, least = close, np.where(explained, 0.01 * RANK_ONE, RANK_ONE)[:, None]
     double = near & (_second_singular(estimate, solution, near) < least)

@@ -10,6 +10,7 @@ from accepted_hits import accepted
 from numpy.typing import NDArray
 from simulate_modal import TrueSystem, records_of, simulate_hits
 
+from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.ingest.records import HitSamples
@@ -113,13 +114,11 @@ def test_close_modes_are_not_taken_for_changes() -> None:
 def test_sensors_that_rove_have_no_gain_that_changed_but_may_be_reversed() -> None:
     gains = constant()
     gains[1, 2] = 1.3
-    frfs = estimate_frfs(hits_of(gains))
-    hits = frfs.hits.copy()
-    hits[0] *= 2  # the sensor that stays takes part in every turn
-    roving = replace(frfs, hits=hits)
+    channels = (ChannelQuality("stays"), *(ChannelQuality("roves") for _ in OUTPUTS[1:]))
+    roving = replace(estimate_frfs(hits_of(gains)), channels=channels)
     assert gain_changes(roving, plain_residues(roving, BAND)) is None
     gains[1, 2] = -1.0
-    reversed_once = replace(estimate_frfs(hits_of(gains)), hits=hits)
+    reversed_once = replace(estimate_frfs(hits_of(gains)), channels=channels)
     changes = gain_changes(reversed_once, plain_residues(reversed_once, BAND))
     assert changes is not None
     assert np.flatnonzero(changes.factors != 1).tolist() == [1 * len(INPUTS) + 2]
