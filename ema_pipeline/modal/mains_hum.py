@@ -58,6 +58,10 @@ GOES_ON = 0.3
 """Share of a mode left at the end of the record above which it may be a tone where hits do not tell: noise makes tones
 seem to decay."""
 
+WIDEST_LINES = 6.0
+"""Lines from a multiple of the mains' frequency within which a broad peak may be hum: the half-width of a mode of 12 %
+damping reaches one from anywhere."""
+
 REASON = "single hits show a tone at a multiple of the mains' frequency, not a decay after the blow: hum"
 
 
@@ -152,7 +156,8 @@ def _candidate(modal: ModalModel, index: int, frfs: FrfSet, rest_s: float) -> _C
     mode = modal.modes[index]
     # hum whose phases differ makes as broad a peak as it seems to decay
     half_width = -mode.pole.real / (2 * np.pi)
-    tone = _tone(mode.frequency_hz, max(MAINS_DRIFT * mode.frequency_hz, 0.5 / rest_s, half_width))
+    broad = min(half_width, WIDEST_LINES / rest_s)
+    tone = _tone(mode.frequency_hz, max(MAINS_DRIFT * mode.frequency_hz, 0.5 / rest_s, broad))
     if not np.isfinite(tone):
         return None
     step = float(frfs.frequency_hz[1])

@@ -103,6 +103,11 @@ def test_a_mode_beside_the_mains_is_no_hum() -> None:
     assert same is kept
 
 
+def test_a_heavily_damped_mode_whose_half_width_reaches_hum_is_none() -> None:
+    kept, same = judged(with_hum(50.0, 1.0), 142.0, 0.1 * 2 * np.pi * 142.0)
+    assert same is kept
+
+
 def test_a_mode_that_the_user_includes_is_no_hum() -> None:
     asked = KnownPeaks(np.array([-0.1 + 2j * np.pi * 150.01]), np.array([1.0]), np.ones((1, 2)))
     kept, same = judged(with_hum(50.0), 150.01, 0.1, asked)
