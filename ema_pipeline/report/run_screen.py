@@ -173,7 +173,9 @@ def _diagnosed(found: Diagnosis) -> str:
         sure = named(diagnosis.undisputed(found))
         told = f"{diagnosis.heading_of_alike(found)}: {named(diagnosis.alike(found))}."
         return f"Missing: {sure}. Beside it, {told[:1].lower()}{told[1:]}" if sure else told
-    return f"{heading} (error {plain(error, 3)})."
+    closest = found.ladder.rungs[-1].error if found.ladder.rungs and diagnosis.claimed(found) else error
+    errors = dict.fromkeys((plain(error, 3), plain(closest, 3)))  # without and with what is closest
+    return f"{heading} (error {' → '.join(errors)})."
 
 
 def data_line(results: RunResults) -> str:

@@ -60,6 +60,11 @@ def findings(results: RunResults) -> tuple[str, ...]:
                 f"Model and measurement differ by {size} standard uncertainties (root mean square); "
                 "the diagnosis above says what would reduce this."
             )
+        elif explained and verdict == "unknown_effect" and not results.diagnosis_is_old:
+            lines.append(
+                f"Model and measurement differ by {size} standard uncertainties (root mean square); "
+                "the diagnosis above says why the model fails all the same."
+            )
         elif explained:
             lines.append(
                 f"Model and measurement differ by {size} standard uncertainties (root mean square): "

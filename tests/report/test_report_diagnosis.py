@@ -202,6 +202,8 @@ def test_what_is_claimed_of_a_model_that_fails_is_in_the_heading() -> None:
     assert diagnosis.heading(closest) == (
         "Something is missing that the library does not explain; closest to it: mesh stiffness loss at sun-planet1"
     )
+    assert run_screen._diagnosed(closest) == f"{diagnosis.heading(closest)} (error 3.10 → 2.40)."
+    assert run_screen._diagnosed(told) == f"{diagnosis.heading(told)} (error 3.10)."
 
 
 def test_three_that_fit_alike_are_counted_in_the_heading() -> None:
