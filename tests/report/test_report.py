@@ -423,7 +423,9 @@ def test_summary_speaks_of_agreement_only_where_the_error_is_about_one(run: RunR
     assert "more than the measurement's uncertainty explains" in " ".join(summary.findings(run))
     good = replace(run, comparison=replace(run.comparison, error=1.04))
     assert "to within their uncertainty" in " ".join(summary.findings(good))
-    failing: Any = SimpleNamespace(verdict="unknown_effect")
+    failing: Any = SimpleNamespace(
+        verdict="unknown_effect", candidates=(), ladder=SimpleNamespace(rungs=()), error_limit=1.3
+    )
     told = " ".join(summary.findings(replace(good, diagnosis=failing, diagnosed_on=good.added)))
     assert "to within their uncertainty" not in told
     assert "the diagnosis above says why the model fails all the same" in told
