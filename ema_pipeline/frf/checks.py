@@ -267,7 +267,10 @@ def _reciprocity(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Che
             difference = float(np.sqrt(beyond) / size) if size > 0 else 0.0
             passes = difference <= settings.reciprocity
             name = f"{frfs.outputs[o1]} and {frfs.outputs[o2]}"
-            fault = f"FRFs between {name} differ by {difference:.0%} with the direction: position, or a nonlinearity"
+            fault = (
+                f"FRFs between {name} differ by {difference:.0%} with the direction: hits off their direction or "
+                "place, frequencies that drift, or a nonlinearity"
+            )
             limit = settings.reciprocity
             verdicts.append(
                 judged("reciprocity", difference, limit, passes, RECIPROCITY, "warn", fault, channel=name)
