@@ -253,11 +253,16 @@ def _named(found: Diagnosis) -> str:
     named = "; ".join(
         f"{missing}{label_words(c.label)}"
         + (f", {size_words(c.parameters, ', ')}" if c.parameters else "")
-        + f" (probability {probability_text(c.probability)}, "
-        + f"error {plain(c.error_before, 3)} → {plain(c.error_after, 3)})"
+        + f" (probability {probability_text(c.probability)}, {_fall(c)})"
         for c in leading(found)
     )
     return named or "nothing"
+
+
+def _fall(c: Candidate) -> str:
+    if c.claimed and c.error_after >= c.error_before:
+        return "beside the others"
+    return f"error {plain(c.error_before, 3)} → {plain(c.error_after, 3)}"
 
 
 def next_commands(

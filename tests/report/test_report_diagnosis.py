@@ -227,6 +227,8 @@ def test_what_is_claimed_beside_effects_that_fit_alike_is_told_with_them() -> No
     assert words == ["supported", "fits equally well", "fits equally well"]
     with_another = replace(sure, claimed=True, error_after=3.2)  # its fit bends parts for the other one
     assert diagnosis.standing(both, with_another) == "supported, not alone"
+    pair = replace(found("effect"), candidates=(with_another, *one.candidates[1:]))
+    assert "(probability 50 %, beside the others)" in diagnosis.compact(pair)
     assert diagnosis.next_commands(both, "out") == (
         f"ema add out {CRACK} {OTHER}",
         f"ema add out {CRACK} {SUPPORT}",
