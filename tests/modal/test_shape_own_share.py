@@ -22,12 +22,14 @@ OMEGA = np.linspace(50.0, 350.0, 601)
 ESTIMATE = Estimate(POLES, np.ones((2, 1), complex))
 
 
-def fitted(common: float, own: float, transposed: bool = False) -> np.ndarray:
+def fitted(common: float, own: float, transposed: bool = False, in_turn: bool = False) -> np.ndarray:
     """Share of three rows of two modes, the last row not measured; noise of its own twice as strong about mode two."""
     level = np.where(OMEGA < 200.0, own, 2.0 * own) * np.ones((3, 1, 1))
     noise = Noise(np.full((3, 1, len(OMEGA)), common), level)
     measured = np.array([[True], [True], [False]])
-    data: Any = SimpleNamespace(omega=OMEGA, frf=level, transposed=transposed, measured=measured)
+    data: Any = SimpleNamespace(
+        omega=OMEGA, frf=level, transposed=transposed, in_turn=in_turn, measured=measured
+    )
     return own_share(data, ESTIMATE, noise)
 
 
@@ -39,8 +41,9 @@ def test_noise_of_the_hits_is_in_common_and_noise_of_the_channels_is_not() -> No
     assert share[2].tolist() == [1.0, 1.0]  # nothing is known of what was not measured
 
 
-def test_struck_points_have_hits_of_their_own() -> None:
+def test_struck_points_and_turns_of_moved_sensors_have_hits_of_their_own() -> None:
     np.testing.assert_array_equal(fitted(3.0, 1.0, transposed=True), 1.0)
+    np.testing.assert_array_equal(fitted(3.0, 1.0, in_turn=True), 1.0)
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
