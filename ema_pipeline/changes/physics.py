@@ -117,7 +117,7 @@ def pair_observations(a: Run, b: Run, repeat: RepeatSettings | None = None) -> P
     common = [c for c in of_a if c in of_b]
     if not common:
         raise EmaError(
-            f"{a.store.folder} and {b.store.folder}: no configuration in common ({', '.join(of_a)}; "
+            f"{a.info.raw} and {b.info.raw}: no configuration in common ({', '.join(of_a)}; "
             f"{', '.join(of_b)}); compare tests of the same configurations"
         )
     pairs = {c: match_modes(of_a[c], of_b[c]) for c in common}

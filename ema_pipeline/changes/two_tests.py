@@ -114,7 +114,7 @@ def compare_runs(
     of_a, of_b = measured_modes(a), measured_modes(b)
     if not any(c in of_b for c in of_a):
         raise EmaError(
-            f"{a.store.folder} and {b.store.folder}: no configuration in common ({', '.join(of_a)}; "
+            f"{a.info.raw} and {b.info.raw}: no configuration in common ({', '.join(of_a)}; "
             f"{', '.join(of_b)}); compare tests of the same configurations"
         )
     physics = None
