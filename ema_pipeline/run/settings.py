@@ -132,6 +132,8 @@ def _settings(data: dict[str, Any], overrides: Iterable[str], where: str) -> Pip
         key, sign, value = change.partition("=")
         if not sign or not key.strip():
             raise EmaError(f"--set {change}: is not of the form stage.key=value")
+        if key.strip() == "rig":  # says for which rig a pipeline is made, and chooses none
+            raise EmaError(f"--set {change}: name the rig of a test with --rig")
         *parents, last = key.strip().split(".")
         known = setting_names(PipelineSettings)
         if key.strip() not in known and (alike := [k for k in known if k.split(".")[-1] == last]):
