@@ -90,7 +90,7 @@ class Tried:
     unknown : float
         Of the size.
     gain : float
-        By how much the cost falls, at wide uncertainties.
+        By how much the cost falls, at wide uncertainties, or that of modes without a partner, if this is more.
     """
 
     unknown: float
@@ -138,11 +138,10 @@ def tried_sizes(
         sizes = [*_SIZES, *problem.tuned(begin, unknowns.names[at])]
         sizes = [size for size in sizes if unknowns.clipped(at_size(size))[at] == size]
         fewer = [s for s in sizes if problem.unpaired(at_size(s), scatters, _GRID_HEAT) < without.penalty]
-        if not fewer:
-            return Tried(0.0, -np.inf)
-        least, size = min((compared(s).cost, s) for s in fewer)
-        # what turns coinciding modes of nominal parts into each other does so at any size: no size is the worse for it
-        return Tried(size, max(without.cost, compared(_SMALLEST).cost) - least)
+        least, size = min(((compared(s).cost, s) for s in fewer), default=(np.inf, 0.0))
+        # what turns coinciding modes of nominal parts into each other, or apart, is no worse for that
+        gain = max(without.cost, compared(_SMALLEST).cost) - least
+        return Tried(size, max(gain, without.penalty - compared(size).penalty))
 
     found = zip(asked, spread(best, asked, processes), strict=True)
     return {h.label: tried for h, tried in found if tried.gain > 0}

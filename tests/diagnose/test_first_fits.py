@@ -224,6 +224,24 @@ def test_what_turns_coinciding_modes_at_any_size_is_told_by_the_larger_ones() ->
     assert found["a"].gain == pytest.approx(PENALTY + 0.5 * ((7.0 - 0.003) ** 2 - 1.0) / 30.0**2)
 
 
+def test_what_gives_a_mode_a_partner_is_tried_though_it_turns_other_modes_apart() -> None:
+    """A spring at a planet lifts the rotation of a gear train from 0 Hz, and splits double modes of nominal parts."""
+    base = with_model("base", Parabola(("part",), ()), [0.4])
+    names = ("part", "a.s1")
+
+    class Splitting(Parabola):
+        def residuals(self, x: np.ndarray, scatters: Any, **more: Any) -> Any:
+            found = super().residuals(x, scatters, **more)
+            return replace(found, log_scale=found.log_scale + 100.0 * x[1])
+
+    problem = Splitting(names, names[1:], np.array([0.0, 7.0]), 3.0)
+    problem.unknowns = Unknowns(names, np.ones(2), ("part", ""), np.full(2, -20.0), np.full(2, 9.0))
+    model = with_model("a", problem, [0.0, 0.0]).model
+    data: Any = SimpleNamespace(scatters={})
+    found = tried_sizes(data, base, {"a": model}, [hypothesis("a")], 1)
+    assert found == {"a": Tried(4.0, PENALTY)}
+
+
 def test_sizes_that_give_modes_a_partner_are_tried_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
     base = with_model("base", Parabola(("part",), ()), [0.4])
     names = ("part", "a.s1")
