@@ -331,7 +331,7 @@ def text_table(source: tables.Table, title: str) -> Safe:
 
     def made(clean: Clean, width: int) -> RenderableType:
         kept = _kept(source)
-        if _widths(source, kept, clean, width) is None:
+        if len(kept) > 1 and _widths(source, kept, clean, width) is None:
             return Group(*_blocks(source.picked(kept), title, clean, width))
         return build_table(source, title, clean, width)
 

@@ -549,6 +549,11 @@ def test_no_number_is_broken_on_a_narrow_terminal(run: RunResults, width: int) -
     assert "column" in told  # some stand below the others
 
 
+def test_a_single_column_is_shown_however_narrow_the_terminal_is() -> None:
+    one = tables.Table(("record",), (tables.Row(("sun_x_150N_1.uff",)),), frozenset())
+    assert "sun_x_150N" in "".join(_printed(terminal.text_table(one, "Records"), 12).split())
+
+
 def test_comparison_says_that_its_error_is_that_of_the_fit(run: RunResults) -> None:
     assert run.comparison is not None
     told = " ".join(_printed(terminal.comparison_tables(run.comparison), 80).split())
