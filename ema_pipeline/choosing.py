@@ -85,10 +85,7 @@ def excluding(hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Change:
         choices = run.info.choices
         for text in hits:
             hit = _hit(run, text)
-            if hit in run.info.choices.excluded_hits:
-                raise EmaError(f"hit '{hit}' is excluded already")
-            if hit in choices.excluded_hits:
-                raise EmaError(f"hit '{hit}' is named twice; name it once")
+            _require_new(f"hit '{hit}'", hit, run.info.choices.excluded_hits, choices.excluded_hits)
             choices = dataclasses.replace(choices, excluded_hits=(*choices.excluded_hits, hit))
             _require_others(run, choices, hit)
         for text in modes:
@@ -99,10 +96,7 @@ def excluding(hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Change:
                 choices = dataclasses.replace(choices, included_modes=left)
                 continue
             choice = _mode(run, configuration, frequency)
-            if choice in run.info.choices.excluded_modes:
-                raise EmaError(f"mode '{choice}' is excluded already")
-            if choice in choices.excluded_modes:
-                raise EmaError(f"mode '{choice}' is named twice; name it once")
+            _require_new(f"mode '{choice}'", choice, run.info.choices.excluded_modes, choices.excluded_modes)
             choices = dataclasses.replace(choices, excluded_modes=(*choices.excluded_modes, choice))
         _require_modes(run, choices)
         return choices
@@ -146,6 +140,16 @@ def including(hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Change:
         return choices
 
     return change
+
+
+def _require_new(
+    what: str, item: HitChoice | ModeChoice, before: Sequence[object], now: Sequence[object]
+) -> None:
+    """EmaError for what was excluded `before`, or is among what is excluded `now`."""
+    if item in before:
+        raise EmaError(f"{what} is excluded already")
+    if item in now:
+        raise EmaError(f"{what} is named twice; name it once")
 
 
 def _near(chosen: Sequence[ModeChoice], configuration: str, frequency_hz: float) -> ModeChoice | None:

@@ -63,8 +63,8 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a character gets its escape
             stream.reconfigure(errors="backslashreplace")
     try:
-        answer_ctrl_c(program())
         _refuse_lost_folder()
+        answer_ctrl_c(program())
         _refuse_empty(sys.argv[1:])
         app()
     except EmaError as error:

@@ -73,7 +73,9 @@ def file_hash(path: Path) -> str:
         raise EmaError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def refuse_existing(paths: Iterable[Path]) -> None:
+def refuse_existing(
+    paths: Iterable[Path], remedy: str = "name another folder with --to, or remove it"
+) -> None:
     """Refuse to write files into a folder of the user's where one is there already.
 
     Raises
@@ -83,7 +85,7 @@ def refuse_existing(paths: Iterable[Path]) -> None:
     """
     found = next((path for path in paths if path.exists()), None)
     if found is not None:
-        raise EmaError(f"{found}: exists already and is kept; name another folder with --to, or remove it")
+        raise EmaError(f"{found}: exists already and is kept; {remedy}")
 
 
 @contextmanager

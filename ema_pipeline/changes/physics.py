@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from ema_pipeline.correlate.matching import match_modes
+from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.types import Candidate, Diagnosis
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import merged
@@ -111,8 +112,14 @@ def _as_change(c: Candidate) -> Candidate:
     return replace(c, effect=_OTHERWISE, title="mass at a body", equivalents=names)
 
 
-def pair_observations(a: Run, b: Run, repeat: RepeatSettings | None = None) -> PairObservations:
-    """The modes of two runs as one observation."""
+def modes_of_both(a: Run, b: Run) -> tuple[dict[str, MeasuredModes], dict[str, MeasuredModes], list[str]]:
+    """Measured modes of two runs, and the configurations that both have.
+
+    Raises
+    ------
+    EmaError
+        Where there is none.
+    """
     of_a, of_b = measured_modes(a), measured_modes(b)
     common = [c for c in of_a if c in of_b]
     if not common:
@@ -120,6 +127,12 @@ def pair_observations(a: Run, b: Run, repeat: RepeatSettings | None = None) -> P
             f"{a.info.raw} and {b.info.raw}: no configuration in common ({', '.join(of_a)}; "
             f"{', '.join(of_b)}); compare tests of the same configurations"
         )
+    return of_a, of_b, common
+
+
+def pair_observations(a: Run, b: Run, repeat: RepeatSettings | None = None) -> PairObservations:
+    """The modes of two runs as one observation."""
+    of_a, of_b, common = modes_of_both(a, b)
     pairs = {c: match_modes(of_a[c], of_b[c]) for c in common}
     if not any((p >= 0).any() for p in pairs.values()):
         raise EmaError(f"{a.store.folder} and {b.store.folder}: no mode of one is a mode of the other")

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from ema_pipeline.answers import CHANGES_FILE
 from ema_pipeline.changes.modes import ModeChanges, mode_changes
-from ema_pipeline.changes.physics import PhysicalChange, Progress, physical_change
+from ema_pipeline.changes.physics import PhysicalChange, Progress, modes_of_both, physical_change
 from ema_pipeline.describe import checked_rig
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import replace_file
@@ -21,7 +21,6 @@ from ema_pipeline.observations.pair import RepeatSettings
 from ema_pipeline.pipeline import ShowStage
 from ema_pipeline.report.summary_files import finite
 from ema_pipeline.results_folder import RESULTS_FILE
-from ema_pipeline.run.measured import measured_modes
 from ema_pipeline.run.opening import existing_run
 from ema_pipeline.run.types import Run
 
@@ -111,12 +110,7 @@ def compare_runs(
     by_rig: bool = True,
 ) -> Changes:
     """What changed from one run to another; physically where both have a rig that is to be used."""
-    of_a, of_b = measured_modes(a), measured_modes(b)
-    if not any(c in of_b for c in of_a):
-        raise EmaError(
-            f"{a.info.raw} and {b.info.raw}: no configuration in common ({', '.join(of_a)}; "
-            f"{', '.join(of_b)}); compare tests of the same configurations"
-        )
+    of_a, of_b, _ = modes_of_both(a, b)
     physics = None
     if by_rig and a.rig is not None and b.rig is not None:
         physics = physical_change(a, b, progress, repeat)

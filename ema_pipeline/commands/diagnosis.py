@@ -114,9 +114,11 @@ def _change(
             _show_ladder(run)
         with progress(quiet) as show_stage:
             run_stages(run, AFTER_EFFECTS, show_stage)
-    if not quiet and json:
+    if quiet:
+        return
+    if json:
         _show_ladder(run, json)
-    elif not quiet:
+    else:
         results = load_results(run, synthesis=False)
         model, report = model_words(results.added), run.store.folder / "report.html"
         told = results.current_rung or results.fit  # as the ladder states it: the fit may bend parts further

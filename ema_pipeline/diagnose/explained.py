@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED, DiagnoseSettings
 from ema_pipeline.inference import Posterior, beyond
-from ema_pipeline.inference.bounded import FURTHEST
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import PARTS, Fit, at_scatters, part_reach, within_scatter
 from ema_pipeline.observations.hit_residuals import LINEARISATION
@@ -206,8 +205,8 @@ def _squares_of_own_damping(p: Posterior, usual: float) -> NDArray[np.float64]:
 def outlying_parts(observations: Observations, fit: Fit) -> tuple[OutlyingPart, ...]:
     """Every part, and every joint's damping, that lies further out than its like scatter, furthest first."""
     p = fit.posterior
-    one_sigma = part_reach(observations, p, 1.0, (*PARTS, JOINT_DAMPING))
-    most = {name: FURTHEST * reach for name, reach in one_sigma.items()}
+    kinds = (*PARTS, JOINT_DAMPING)
+    one_sigma, most = part_reach(observations, p, 1.0, kinds), part_reach(observations, p, kinds=kinds)
     names = [p.unknowns.names[i] for i in np.flatnonzero(beyond(p, most))]
     found = [OutlyingPart(n, float(np.expm1(p.value(n))), one_sigma[n]) for n in names]
     return tuple(sorted(found, key=lambda part: -abs(part.deviation) / part.others))

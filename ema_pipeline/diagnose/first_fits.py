@@ -138,7 +138,9 @@ def tried_sizes(
         sizes = [*_SIZES, *problem.tuned(begin, unknowns.names[at])]
         sizes = [size for size in sizes if unknowns.clipped(at_size(size))[at] == size]
         fewer = [s for s in sizes if problem.unpaired(at_size(s), scatters, _GRID_HEAT) < without.penalty]
-        least, size = min(((compared(s).cost, s) for s in fewer), default=(np.inf, 0.0))
+        if not fewer:
+            return Tried(0.0, -np.inf)
+        least, size = min((compared(s).cost, s) for s in fewer)
         # what turns coinciding modes of nominal parts into each other, or apart, is no worse for that
         gain = max(without.cost, compared(_SMALLEST).cost) - least
         return Tried(size, max(gain, without.penalty - compared(size).penalty))

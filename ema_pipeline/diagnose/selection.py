@@ -122,9 +122,10 @@ def select(
     while True:
         leading = earlier.leading if len(claimed) < earlier.rounds and ahead is None else ()
         found, ahead = ahead or ask(base, claimed, rounds, leading), None
-        if leading and found.best is None and not _tentative(observations, found, settings):
-            found = ask(base, claimed, rounds)
         leaders = _tentative(observations, found, settings)
+        if leading and found.best is None and not leaders:
+            found = ask(base, claimed, rounds)
+            leaders = _tentative(observations, found, settings)
         for leader in leaders if len(claimed) + 1 < settings.most_effects else ():
             base = fit_base(observations, leader.ranked.fit.model, leader.ranked.fit)
             further = ask(base, [*claimed, leader], [*rounds, found])

@@ -8,13 +8,12 @@ from collections.abc import Mapping, Sequence
 from ema_pipeline.diagnose.explained import Explanation, OutlyingDamping, OutlyingPart
 from ema_pipeline.diagnose.types import NOT_DETERMINED, EffectSize, VerdictWord
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
+from ema_pipeline.inference import LEAST_LIMIT
 from ema_pipeline.number_text import format_value
 from ema_pipeline.plain_text import part_words
 
 _SHOWN = 3
 """Parts that a sentence names."""
-_LOOKS_RIGHT = 1.3
-"""Error of models that explain the data, as a rule."""
 
 
 def label_text(label: str) -> str:
@@ -112,7 +111,7 @@ def summary(
 
 def not_explained(told: str, error: float) -> str:
     """That a model fails, with its error as it is `told`, which alone does not always show that."""
-    return f"The model does not explain the data ({'though its error is' if error <= _LOOKS_RIGHT else 'error'} {told})"
+    return f"The model does not explain the data ({'though its error is' if error <= LEAST_LIMIT else 'error'} {told})"
 
 
 def _candidate(best: tuple[str, str]) -> str:

@@ -43,6 +43,11 @@ class ChannelQuality:
     aim: ClassVar[float] = 0.0
     """Relative 1 σ of how much of a blow its direction lets act, for all modes alike."""
 
+    @property
+    def sensors(self) -> list[str]:
+        """Names of the sensors that have measured there."""
+        return self.name.split(SEVERAL)
+
 
 @dataclass(frozen=True)
 class InTurn(ChannelQuality):
@@ -79,7 +84,7 @@ def channel_uncertainty(frfs: FrfSet | None, dof: Dof) -> ChannelQuality:
         return ChannelQuality()
     for output, channel in zip(frfs.outputs, frfs.channels, strict=False):
         if output.point == dof.point:
-            moved = moved_sensors(frfs) & set(channel.name.split(SEVERAL))
+            moved = moved_sensors(frfs) & set(channel.sensors)
             return InTurn(channel.name, channel.calibration_std, channel.transverse) if moved else channel
     if dof.point in {d.point for d in frfs.inputs} - {d.point for d in frfs.outputs}:
         hammer = hammer_uncertainty(frfs)
@@ -89,7 +94,7 @@ def channel_uncertainty(frfs: FrfSet | None, dof: Dof) -> ChannelQuality:
 
 def moved_sensors(frfs: FrfSet) -> set[str]:
     """Names of the sensors that have measured several outputs."""
-    names = Counter(name for channel in frfs.channels for name in channel.name.split(SEVERAL) if name)
+    names = Counter(name for channel in frfs.channels for name in channel.sensors if name)
     return {name for name, count in names.items() if count > 1}
 
 
@@ -102,7 +107,7 @@ def merged(one: ChannelQuality | None, other: ChannelQuality) -> ChannelQuality:
     """Uncertainty of a DOF at which two records were taken: never better than that of either sensor."""
     if one is None or one == other:
         return other
-    names = list(dict.fromkeys([*one.name.split(SEVERAL), other.name]))
+    names = list(dict.fromkeys([*one.sensors, other.name]))
     worse = max(one, other, key=lambda channel: (channel.off_direction, channel.aim))
     return type(worse)(
         SEVERAL.join(names),

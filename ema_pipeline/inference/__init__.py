@@ -8,7 +8,7 @@ from ema_pipeline.inference.bounded import Bounded, beyond, reach
 from ema_pipeline.inference.factor import lower_factor, solve_lower
 from ema_pipeline.inference.marginal import averaged_over_others
 from ema_pipeline.inference.maximise import anneal, descend
-from ema_pipeline.inference.posterior import ERROR_LIMIT, Posterior, error_limit
+from ema_pipeline.inference.posterior import ERROR_LIMIT, LEAST_LIMIT, Posterior, error_limit
 from ema_pipeline.inference.problem import Apart, Problem, Residuals, same_matching
 from ema_pipeline.inference.scatter import Scatter, learn, widened
 from ema_pipeline.inference.scatter_cost import CostOverScatters
@@ -16,6 +16,7 @@ from ema_pipeline.inference.unknowns import Unknowns, joined
 
 __all__ = [
     "ERROR_LIMIT",
+    "LEAST_LIMIT",
     "Apart",
     "Bounded",
     "CostOverScatters",

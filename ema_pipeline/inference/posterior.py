@@ -16,7 +16,7 @@ from ema_pipeline.inference.unknowns import Unknowns
 
 ERROR_LIMIT = 1.5
 """Error up to which a model explains few data."""
-_LEAST_LIMIT = 1.3
+LEAST_LIMIT = 1.3
 """The same of many, whose σ are themselves known to some tenths only: of 400 models of simulated rigs that lacked
 nothing one had an error above it, of 103 that lacked too little to be named ten."""
 _ONCE_IN = 1e-3
@@ -39,7 +39,7 @@ def error_limit(count: int, most: float = ERROR_LIMIT) -> float:
         Largest limit; all are in proportion to it.
     """
     by_chance = np.sqrt(scipy.special.chdtri(count, _ONCE_IN) / count) if count > 0 else ERROR_LIMIT
-    return float(np.clip(by_chance, _LEAST_LIMIT, ERROR_LIMIT)) * most / ERROR_LIMIT
+    return float(np.clip(by_chance, LEAST_LIMIT, ERROR_LIMIT)) * most / ERROR_LIMIT
 
 
 @dataclass(frozen=True)

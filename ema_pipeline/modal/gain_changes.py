@@ -173,9 +173,8 @@ def gain_changes(frfs: FrfSet, found: Sequence[PlainResidues]) -> GainChanges | 
         return None
     signs = signs_of(found)
     if moved_sensors(frfs):
-        return (
-            None if np.all(signs > 0) else GainChanges(frfs.outputs, frfs.inputs, signs.T.astype(float), 0.0)
-        )
+        reversed_ones = GainChanges(frfs.outputs, frfs.inputs, signs.T.astype(float), 0.0)
+        return reversed_ones if np.any(signs < 0) else None
     peaks = [_Peak(p.residues, p.variance, first_right(p.residues, 1)) for p in upright(found, signs)]
     cells, logarithms, covariance = _selected(*_weighed(peaks))
     if not cells and np.all(signs > 0):

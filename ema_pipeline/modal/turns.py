@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
-from ema_pipeline.frf.channels import OFF_DIRECTION, SEVERAL, moved_sensors
+from ema_pipeline.frf.channels import OFF_DIRECTION, moved_sensors
 from ema_pipeline.frf.types import FrfSet
 
 AXES = {"x", "y", "z"}
@@ -47,7 +47,7 @@ def spread_of_turns(frfs: FrfSet, dofs: Sequence[Dof], shapes: NDArray[np.comple
     across = np.stack([_across(frfs.inputs[k], place, power) for k in struck], axis=1)
     total = np.sum(along, axis=1)
     for output, channel, hits in zip(frfs.outputs, frfs.channels, frfs.hits[:, struck], strict=True):
-        if output.point not in place or not moved & set(channel.name.split(SEVERAL)):
+        if output.point not in place or not moved & set(channel.sensors):
             continue
         # hits on all points tell of the entry, by the square of the shape there
         variance = OF_ONE_HIT**2 * np.sum(along * across / np.maximum(hits, 1), axis=1)

@@ -89,9 +89,8 @@ def standing(found: Diagnosis, candidate: Candidate) -> str:
         return "fits equally well"
     if candidate.claimed and found.verdict == "unknown_effect":
         return "best, not enough"
-    if candidate.claimed:  # beside the first of two that are missing parts are still bent for the other one
-        raises = candidate.error_after >= candidate.error_before
-        return "supported, not alone" if raises else "supported"
+    if candidate.claimed:
+        return "supported, not alone" if _not_alone(candidate) else "supported"
     if candidate.log_evidence < candidate.threshold:
         return "not enough evidence"
     return "less likely"
@@ -260,9 +259,14 @@ def _named(found: Diagnosis) -> str:
 
 
 def _fall(c: Candidate) -> str:
-    if c.claimed and c.error_after >= c.error_before:
+    if c.claimed and _not_alone(c):
         return "beside the others"
     return f"error {plain(c.error_before, 3)} → {plain(c.error_after, 3)}"
+
+
+def _not_alone(c: Candidate) -> bool:
+    """True for the first of two that are missing beside which parts are still bent for the other one."""
+    return c.error_after >= c.error_before
 
 
 def next_commands(

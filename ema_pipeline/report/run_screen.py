@@ -94,8 +94,8 @@ def _fitted(table: Table, clean: Clean, console: Console, options: ConsoleOption
     """The table of modes without the columns that it is too wide for: first the model's frequencies, which the
     differences tell.
     """
-    for name in ("", *_GIVE_WAY):
-        table = table.picked([k for k, head in enumerate(table.head) if not name or head != name])
+    for name in (None, *_GIVE_WAY):
+        table = table.picked([k for k, head in enumerate(table.head) if head != name])
         built = build_table(table, "", clean, ruled=False)
         if Measurement.get(console, options.update(max_width=10_000), built).maximum <= options.max_width:
             break

@@ -16,6 +16,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import effect_of
 from ema_pipeline.effects.library import Library, parse_sized
 from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.files import refuse_existing
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.rigs import load_rig, model_modes, rig_names
 from ema_pipeline.rigs.entries import LARGEST
@@ -123,11 +124,10 @@ def simulate_campaign(
     random = np.random.default_rng(options.seed)
     of_values = random if options.rig_seed is None else np.random.default_rng(options.rig_seed)
     true = true_values(made.rig, values or {}, options.scatter, of_values)
-    _check_bad_hits(options, chosen)
     _check_dofs(base, chosen, sensors, impacts)
     own_file = Path(rig) if isinstance(rig, str | Path) and str(rig) not in rig_names() else None
     tests = _tests(base, base.name if own_file is None else "", chosen, sensors, impacts, options)
-    _check_points_of_bad_hits(options, tests)
+    _check_bad_hits(options, tests)
     truth: dict[str, Any] = {
         "rig": base.name,
         "effects": list(effects),
@@ -155,9 +155,7 @@ def simulate_campaign(
 def _moved(made_in: Path, out: Path) -> None:
     """Move all files to a folder, unless one of them would replace another."""
     files = sorted(path.relative_to(made_in) for path in made_in.rglob("*") if path.is_file())
-    for file in files:
-        if (out / file).exists():
-            raise EmaError(f"{out / file}: would be replaced; name another folder or delete it")
+    refuse_existing((out / file for file in files), "name another folder, or remove it")
     for file in files:
         (out / file).parent.mkdir(parents=True, exist_ok=True)
         (made_in / file).replace(out / file)
@@ -226,10 +224,9 @@ def _tests(
     """The test of each configuration, all with the same sensors."""
     tests = []
     for configuration in configurations:
-        folder = Path(configuration if len(configurations) > 1 else "")
         places = _sensors_of(base, configuration, sensors)
         points = _places(impacts, base.assembly(configuration)) or default_impacts(places)
-        tests.append(TestFolder(base.name, rig_key, configuration, folder, places, points, options))
+        tests.append(TestFolder(base.name, rig_key, configuration, places, points, options))
     if options.imperfections.none:
         return tuple(tests)
     measured = [dof.point for c in base.configurations for dof in _sensors_of(base, c, sensors)]
@@ -255,11 +252,12 @@ def _write(
     sizes = options.imperfections
     respond = respond or (response if sizes.none else response_by_poles)
     written = {}
-    for test in (replace(t, folder=out / t.folder) for t in tests):
-        test.folder.mkdir(exist_ok=True)
+    for test in tests:
+        folder = out / test.configuration if len(tests) > 1 else out
+        folder.mkdir(exist_ok=True)
         number = made.rig.configurations.index(test.configuration)
         series = HitSeries(sizes, options.drift_kind, generator(options.seed, "hits", number))
-        hits = test.write(made.rig.assembly(test.configuration, true), respond, random, series)
+        hits = test.write(folder, made.rig.assembly(test.configuration, true), respond, random, series)
         written[test.configuration] = _test_truth(made.rig, test, true, hits)
     return written
 
@@ -336,22 +334,16 @@ def _check_times(options: SimulationSettings) -> None:
         )
 
 
-def _check_bad_hits(options: SimulationSettings, configurations: Sequence[str]) -> None:
+def _check_bad_hits(options: SimulationSettings, tests: Sequence[TestFolder]) -> None:
+    """EmaError for a hit that no test has."""
     for text in (*options.double_hits, *options.overloads):
         match = BAD_HIT.match(text)
         if match is None:
             raise EmaError(f"hit '{text}' is not of the form [configuration:]dof#number, e.g. 'sun.y#2'")
         if match["configuration"] is not None:
-            _known([match["configuration"]], configurations, "configuration")
+            _known([match["configuration"]], [t.configuration for t in tests], "configuration")
         if not 1 <= int(match["number"]) <= options.hits:
             raise EmaError(f"hit '{text}': there are {options.hits} hits per point, numbered from 1")
-
-
-def _check_points_of_bad_hits(options: SimulationSettings, tests: Sequence[TestFolder]) -> None:
-    """EmaError for a hit on a point that no test strikes."""
-    for text in (*options.double_hits, *options.overloads):
-        match = BAD_HIT.match(text)
-        assert match is not None
         asked = [t for t in tests if match["configuration"] in (None, t.configuration)]
         struck = dict.fromkeys(str(dof) for t in asked for dof in t.impacts)
         if match["dof"] not in struck:

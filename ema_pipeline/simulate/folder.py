@@ -38,7 +38,7 @@ Blow = tuple[Pulse, ...]
 
 @dataclass(frozen=True)
 class TestFolder:
-    """One configuration's test: its folder, its channels and its blows.
+    """One configuration's test: its channels and its blows.
 
     Attributes
     ----------
@@ -47,8 +47,6 @@ class TestFolder:
     rig_key : str
         What test.toml says of the rig; empty where a rig.toml lies beside it.
     configuration : str
-    folder : Path
-        Relative to the campaign's until it is written.
     sensors, impacts : tuple of Dof
     options : SimulationSettings
     channels : dict of str to ChannelDraw
@@ -60,14 +58,18 @@ class TestFolder:
     rig: str
     rig_key: str
     configuration: str
-    folder: Path
     sensors: tuple[Dof, ...]
     impacts: tuple[Dof, ...]
     options: SimulationSettings
     channels: Mapping[str, ChannelDraw] = field(default_factory=dict)
 
     def write(
-        self, assembly: Assembly, respond: Respond, random: np.random.Generator, series: HitSeries
+        self,
+        folder: Path,
+        assembly: Assembly,
+        respond: Respond,
+        random: np.random.Generator,
+        series: HitSeries,
     ) -> list[dict[str, Any]]:
         """Write all record files and test.toml; return file, directions and frequencies of every record."""
         o = self.options
@@ -91,7 +93,7 @@ class TestFolder:
                 volts = self._volts(force, accelerations, names, offsets, random)
                 stem = str(impact).replace(".", "_").replace("-", "minus_")
                 file = f"{stem}_{level:g}N_{first}{SUFFIX[o.format]}"
-                WRITERS[o.format](self.folder / file, volts, o.sample_rate_hz)
+                WRITERS[o.format](folder / file, volts, o.sample_rate_hz)
                 lines += ["", "[[records]]", f'file = "{file}"', f'impact = "{impact}"']
                 written.append(
                     {
@@ -100,7 +102,7 @@ class TestFolder:
                         "frequency_factor": [h.frequency_factor for h in drawn],
                     }
                 )
-        (self.folder / "test.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        (folder / "test.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
         return written
 
     def _signals(

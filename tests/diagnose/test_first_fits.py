@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -205,48 +206,52 @@ def test_sizes_far_out_and_small_ones_are_tried_where_modes_have_no_partner() ->
     assert found["far"].gain == pytest.approx(PENALTY + 0.5 * (7.0**2 - 1.0) / 30.0**2)
 
 
-def test_what_turns_coinciding_modes_at_any_size_is_told_by_the_larger_ones() -> None:
+NAMES = ("part", "a.s1")
+
+
+def tried_of(problem: Parabola) -> Tried:
+    """The best of some sizes of the one effect of a problem of `NAMES`."""
+    problem.unknowns = Unknowns(NAMES, np.ones(2), ("part", ""), np.full(2, -20.0), np.full(2, 9.0))
+    base = with_model("base", Parabola(("part",), ()), [0.4])
+    model = with_model("a", problem, [0.0, 0.0]).model
+    data: Any = SimpleNamespace(scatters={})
+    return tried_sizes(data, base, {"a": model}, [hypothesis("a")], 1)["a"]
+
+
+def costing(
+    monkeypatch: pytest.MonkeyPatch, problem: Parabola, further: Callable[[float], float]
+) -> Parabola:
+    """A problem with a further cost, by the size."""
+    plain = problem.residuals
+
+    def residuals(x: np.ndarray, scatters: Any, **more: Any) -> Any:
+        found = plain(x, scatters, **more)
+        return replace(found, log_scale=found.log_scale + further(float(x[1])))
+
+    monkeypatch.setattr(problem, "residuals", residuals)
+    return problem
+
+
+def test_what_turns_coinciding_modes_at_any_size_is_told_by_the_larger_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """As a gyroscopic effect turns the double modes of nominal parts: the smallest size costs as much as a true one."""
-    base = with_model("base", Parabola(("part",), ()), [0.4])
-    names = ("part", "a.s1")
-
-    class Turning(Parabola):
-        def residuals(self, x: np.ndarray, scatters: Any, **more: Any) -> Any:
-            found = super().residuals(x, scatters, **more)
-            return replace(found, log_scale=found.log_scale + (100.0 if x[1] else 0.0))
-
-    problem = Turning(names, names[1:], np.array([0.0, 7.0]), 3.0)
-    problem.unknowns = Unknowns(names, np.ones(2), ("part", ""), np.full(2, -20.0), np.full(2, 9.0))
-    model = with_model("a", problem, [0.0, 0.0]).model
-    data: Any = SimpleNamespace(scatters={})
-    found = tried_sizes(data, base, {"a": model}, [hypothesis("a")], 1)
-    assert found["a"].unknown == 8.0
-    assert found["a"].gain == pytest.approx(PENALTY + 0.5 * ((7.0 - 0.003) ** 2 - 1.0) / 30.0**2)
+    problem = Parabola(NAMES, NAMES[1:], np.array([0.0, 7.0]), 3.0)
+    found = tried_of(costing(monkeypatch, problem, lambda size: 100.0 if size else 0.0))
+    assert found.unknown == 8.0
+    assert found.gain == pytest.approx(PENALTY + 0.5 * ((7.0 - 0.003) ** 2 - 1.0) / 30.0**2)
 
 
-def test_what_gives_a_mode_a_partner_is_tried_though_it_turns_other_modes_apart() -> None:
+def test_what_gives_a_mode_a_partner_is_tried_though_it_turns_other_modes_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A spring at a planet lifts the rotation of a gear train from 0 Hz, and splits double modes of nominal parts."""
-    base = with_model("base", Parabola(("part",), ()), [0.4])
-    names = ("part", "a.s1")
-
-    class Splitting(Parabola):
-        def residuals(self, x: np.ndarray, scatters: Any, **more: Any) -> Any:
-            found = super().residuals(x, scatters, **more)
-            return replace(found, log_scale=found.log_scale + 100.0 * x[1])
-
-    problem = Splitting(names, names[1:], np.array([0.0, 7.0]), 3.0)
-    problem.unknowns = Unknowns(names, np.ones(2), ("part", ""), np.full(2, -20.0), np.full(2, 9.0))
-    model = with_model("a", problem, [0.0, 0.0]).model
-    data: Any = SimpleNamespace(scatters={})
-    found = tried_sizes(data, base, {"a": model}, [hypothesis("a")], 1)
-    assert found == {"a": Tried(4.0, PENALTY)}
+    problem = Parabola(NAMES, NAMES[1:], np.array([0.0, 7.0]), 3.0)
+    assert tried_of(costing(monkeypatch, problem, lambda size: 100.0 * size)) == Tried(4.0, PENALTY)
 
 
 def test_sizes_that_give_modes_a_partner_are_tried_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    base = with_model("base", Parabola(("part",), ()), [0.4])
-    names = ("part", "a.s1")
-    problem = Parabola(names, names[1:], np.array([0.0, 5.8]), 5.0)
-    problem.unknowns = Unknowns(names, np.ones(2), ("part", ""), np.full(2, -20.0), np.full(2, 9.0))
+    problem = Parabola(NAMES, NAMES[1:], np.array([0.0, 5.8]), 5.0)
     asked: list[Any] = []
 
     def tuned(x: np.ndarray, name: str) -> list[float]:
@@ -254,10 +259,7 @@ def test_sizes_that_give_modes_a_partner_are_tried_as_well(monkeypatch: pytest.M
         return [-20.0, 5.7]
 
     monkeypatch.setattr(problem, "tuned", tuned)
-    model = with_model("a", problem, [0.0, 0.0]).model
-    data: Any = SimpleNamespace(scatters={})
-    found = tried_sizes(data, base, {"a": model}, [hypothesis("a")], 1)
-    assert found["a"].unknown == 5.7
+    assert tried_of(problem).unknown == 5.7
     assert asked == [([0.0, 0.0], "a.s1")]
 
 

@@ -212,11 +212,8 @@ def test_effects_are_added_one_by_one_until_nothing_more_is_claimed(monkeypatch:
     assert steps.asked == [(["a@x", "b@y", "c@y"], 0.0), (["b@y", "c@y"], 10.0), (["c@y"], 20.0)]
     assert [name for name, _ in steps.begun] == ["base", "a@x", "b@y"]
     assert steps.begun[1][1] is a.ranked.fit
-    assert steps.reached == [
-        [],
-        [a.ranked.fit],
-        [b.ranked.fit],
-    ]  # the next base is no worse than what was claimed
+    # the next base is no worse than what was claimed
+    assert steps.reached == [[], [a.ranked.fit], [b.ranked.fit]]
     assert found.final is found.rounds[-1].ranking.base
     assert found.final.at == 3  # type: ignore[attr-defined]
     more = pytest.approx(5.5 + SETTINGS.linearised_claim)

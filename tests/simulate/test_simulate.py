@@ -345,7 +345,8 @@ def test_no_file_is_replaced_and_none_is_left_where_one_would_be(tmp_path: Path,
     raw.mkdir()
     mine = raw / name.format(record=record)
     mine.write_text("mine", encoding="utf-8")
-    with pytest.raises(EmaError, match=rf"{re.escape(str(mine))}: would be replaced; name another folder"):
+    told = f"{mine}: exists already and is kept; name another folder, or remove it"
+    with pytest.raises(EmaError, match=re.escape(told)):
         simulate_campaign(raw, rig, duration_s=0.2, hits=1)
     assert [path.name for path in raw.iterdir()] == [mine.name]
     assert mine.read_text(encoding="utf-8") == "mine"
