@@ -38,7 +38,8 @@ class Bounded:
 def reach(found: Posterior, defaults: Mapping[str, float], furthest: float = FURTHEST) -> dict[str, float]:
     """How far every unknown of some scatters may lie, by name: as far as the others of its kind tell.
 
-    A scatter that is learned with the one that stands out grows with it, until nothing stands out.
+    A scatter that is learned with the one that stands out grows with it, until nothing stands out. Parts of which the
+    data tell little stay at their means, and so tell little of how parts scatter: each counts as far as it is told.
 
     Parameters
     ----------
@@ -53,8 +54,9 @@ def reach(found: Posterior, defaults: Mapping[str, float], furthest: float = FUR
         of_kind = np.flatnonzero([s == kind for s in u.scatter])
         unit = u.std[of_kind]
         squares = (found.x[of_kind] / unit) ** 2
+        told = np.clip(1 - (found.std[of_kind] / found.prior_std[of_kind]) ** 2, 0.0, 1.0)
         others = np.sum(squares) - squares + _DEFAULT_COUNT * default**2
-        scatter = np.sqrt(others / (_DEFAULT_COUNT + len(of_kind) - 1))
+        scatter = np.sqrt(others / (_DEFAULT_COUNT + np.sum(told) - told))
         scatter = np.minimum(scatter, found.scatters.get(kind, np.inf))  # several may stand out at once
         limits |= {u.names[i]: furthest * float(s) for i, s in zip(of_kind, scatter * unit, strict=True)}
     return limits

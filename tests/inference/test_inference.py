@@ -492,17 +492,33 @@ def test_a_part_lies_too_far_out_where_the_others_do_not_scatter_so_far() -> Non
         Unknowns.plain(("twice",), 2.0, PARTS),
         Unknowns.plain(("gain",), 1.0, "gains"),
     )
-    none = Residuals(np.zeros(0), np.zeros((0, 7)))
+    exact = Residuals(np.zeros(7), 1e6 * np.eye(7))
     x = 0.02 * np.array([-10.0, 1.0, -1.0, 1.0, 1.0, 2.0, 90.0])
-    found = Posterior(unknowns, x, {PARTS: 0.2, "gains": 0.02}, none)
+    found = Posterior(unknowns, x, {PARTS: 0.2, "gains": 0.02}, exact)
     most = reach(found, {PARTS: 0.02})
     assert most["p0"] == pytest.approx(4 * 0.02)  # four that the default counts as, and the five others
     assert most["twice"] == pytest.approx(4 * 2 * 0.02 * np.sqrt(108 / 9))
     assert set(most) == {*(f"p{k}" for k in range(5)), "twice"}
     np.testing.assert_array_equal(beyond(found, most), [True, *[False] * 6])
     assert reach(found, {PARTS: 0.02}, furthest=1.0)["p0"] == pytest.approx(0.02)
-    several = reach(replace(found, scatters={PARTS: 0.03}), {PARTS: 0.02})  # no further than is learned
+    several = reach(
+        replace(found, scatters={PARTS: 0.03, "gains": 0.02}), {PARTS: 0.02}
+    )  # no further than is learned
     assert several["p1"] == several["twice"] / 2 == pytest.approx(4 * 0.03)
+
+
+def test_parts_of_which_the_data_tell_nothing_do_not_tell_how_parts_scatter() -> None:
+    """They stay at their means whatever they are; half a part is one that is told to half its variance."""
+    unknowns = Unknowns.plain([f"p{k}" for k in range(4)], 1.0, PARTS)
+    x = 0.02 * np.array([3.0, 0.0, 0.0, 0.0])
+    told = Residuals(np.zeros(4), np.diag([1e6, 0.0, 0.0, 0.0]))
+    most = reach(Posterior(unknowns, x, {PARTS: 0.2}, told), {PARTS: 0.02})
+    assert most["p0"] == pytest.approx(4 * 0.02)
+    assert most["p1"] == pytest.approx(4 * 0.02 * np.sqrt(13 / 5))
+    half = Residuals(np.zeros(4), np.diag([1e6, 1 / 0.2, 0.0, 0.0]))
+    assert reach(Posterior(unknowns, x, {PARTS: 0.2}, half), {PARTS: 0.02})["p0"] == pytest.approx(
+        4 * 0.02 * np.sqrt(4 / 4.5)
+    )
 
 
 def test_a_bound_problem_holds_what_is_bound_and_leaves_the_rest() -> None:
