@@ -53,7 +53,7 @@ def scatters_of(rig: Rig) -> dict[str, Scatter]:
 
 
 _BESIDE_JOINTS = {
-    JOINT_DAMPING: Scatter(JOINT_DAMPING, "ln of damping from joint to joint", 0.3, 0.5, 1.0, 5.0, 0.05),
+    JOINT_DAMPING: Scatter(JOINT_DAMPING, "ln of damping from joint to joint", 0.3, 0.3, 1.0, 5.0, 0.05),
     UNEVEN_DAMPING: Scatter(UNEVEN_DAMPING, "damping from part to part", 0.3, 0.5, 1.0, 5.0, 0.1),
 }
 """Where every joint's damping is an unknown of its own: what uneven damping does beside that is little."""
