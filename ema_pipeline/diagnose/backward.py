@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 from ema_pipeline.diagnose.claims import Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
@@ -12,7 +12,7 @@ from ema_pipeline.diagnose.rounds import Round
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, Model, learned, refined, transferred
+from ema_pipeline.observations.fitting import QUICK, Fit, Model, annealed, best_refined, learned, transferred
 from ema_pipeline.processes import spread
 
 _WORTH = 2
@@ -67,24 +67,32 @@ def alike_beside(
 ) -> tuple[tuple[Judged, ...], ...]:
     """Each claim and what explains the data as well in its place, all other claims known.
 
-    What came near an early claim may be far behind once the later ones are known, or be one of them.
+    What came near an early claim may be far behind once the later ones are known, or be one of them, and what was far
+    behind may come near: it is judged anew beside them.
     """
     effects = [j.hypothesis for j in claimed]
     labels = [h.label for h in effects]
+
+    def beside_others(i: int, rivals: Sequence[Judged]) -> Iterator[Judged]:
+        def fitted(rival: Judged) -> Posterior:
+            return _fitted(observations, known, instead(rival.hypothesis), final, rival).posterior
+
+        def instead(*one: Hypothesis) -> list[Hypothesis]:
+            return [*effects[:i], *one, *effects[i + 1 :]]
+
+        base = _fitted(observations, known, instead(), final)
+        for rival, p in zip(rivals, spread(fitted, rivals, settings.processes, _WORTH), strict=True):
+            if final.log_evidence - p.log_evidence < settings.alike:
+                fit = Fit(_with(known, instead(rival.hypothesis)), p)
+                ranked = replace(rival.ranked, fit=fit, gain=p.log_evidence - base.log_evidence)
+                yield judge(observations, Ranking(base, (ranked,)), ranked, settings)
+
     told = []
     for i, one in enumerate(claimed):
-        near = rounds[labels[i]].alike(settings)
-        rivals = [j for j in near if j.hypothesis.label not in labels]
-        if rivals and (one is not claimed[-1] or not any(one is j for j in near)):
-
-            def evidence(rival: Judged, i: int = i) -> float:
-                instead = [*effects[:i], rival.hypothesis, *effects[i + 1 :]]
-                return _fitted(observations, known, instead, final, rival).log_evidence
-
-            reached = spread(evidence, rivals, settings.processes, _WORTH)
-            near_final = (final.log_evidence - e < settings.alike for e in reached)
-            rivals = [j for j, stays in zip(rivals, near_final, strict=True) if stays]
-        told.append((one, *rivals))
+        of = rounds[labels[i]]
+        last = one is claimed[-1] and any(one is j for j in of.alike(settings))
+        rivals = [j for j in (of.alike(settings) if last else of.judged) if j.hypothesis.label not in labels]
+        told.append((one, *(rivals if last or not rivals else beside_others(i, rivals))))
     return tuple(told)
 
 
@@ -168,16 +176,22 @@ def _fitted(
     near: Fit,
     rival: Judged | None = None,
 ) -> Fit:
-    """A model begun at a fit nearby, a rival at its own sizes; scatters learned."""
+    """A model begun at a fit nearby, a rival at its own sizes and annealed; scatters learned.
+
+    With a rival, the sizes of the others may be far from those nearby: twice the mass, beside a spring at its body.
+    """
     model = _with(known, effects)
     problem = model.problem(observations)
     x = transferred(near.posterior, problem.unknowns)
+    starts = [x]
     if rival is not None:
         sizes = rival.ranked.fit.posterior
         for p in rival.hypothesis.placed.effect.parameters:
             name = rival.hypothesis.placed.parameter_name(p.name)
             x[problem.unknowns.index[name]] = sizes.value(name)
-    return learned(observations, refined(observations, model, x, near.posterior.scatters, steps=20))
+        if not observations.slow:
+            starts.append(annealed(observations, model, [x], QUICK).posterior.x)
+    return learned(observations, best_refined(observations, model, starts, near.posterior.scatters))
 
 
 def _judged_anew(

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
+from scipy.special import softmax
 
 from ema_pipeline.diagnose import sentences
 from ema_pipeline.diagnose.claims import Judged
@@ -15,7 +17,7 @@ from ema_pipeline.diagnose.explained import explanation
 from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
 from ema_pipeline.diagnose.in_full import in_full
 from ema_pipeline.diagnose.localise import localise
-from ema_pipeline.diagnose.naming import in_said_names
+from ema_pipeline.diagnose.naming import averaged_size, in_said_names, sizes_of
 from ema_pipeline.diagnose.next_test import next_measurement
 from ema_pipeline.diagnose.probability import CLOSEST, against_nothing, complete, shared
 from ema_pipeline.diagnose.rungs import learned_scatters, noise, rungs_of
@@ -239,7 +241,9 @@ def _faint(
     That is stated with other sizes as usual: friction shows half the force at half the rate as well.
     """
     judged = [j for j in judged if j.hypothesis.placed.effect.linear or len(j.named.sizes) == 1]
-    judged = [j for j in judged if not _gives_partners(j)]
+    # measured modes that have no partner without it show it, whatever else its size changes
+    pairs = [[fit.posterior.residuals.unexplained for fit in (j.base, j.after)] for j in judged]
+    judged = [j for j, (without, beside) in zip(judged, pairs, strict=True) if without <= beside]
     asked = [j.hypothesis for j in judged]
     already = len(found.claimed)
     limits = detection_limits(found.observations, found.final, hypotheses, settings, asked, already)
@@ -254,12 +258,6 @@ def _faint(
     ]
 
 
-def _gives_partners(one: Judged) -> bool:
-    """True where measured modes have no partner without it: that shows it, whatever else its size changes."""
-    without, beside = (fit.posterior.residuals.unexplained for fit in (one.base, one.after))
-    return without > beside
-
-
 def _candidates(
     found: Selection,
     settings: DiagnoseSettings,
@@ -267,9 +265,17 @@ def _candidates(
     hypotheses: Sequence[Hypothesis],
     final: Mapping[str, EffectSize],
 ) -> tuple[Candidate, ...]:
-    """What is claimed, as it was added, with sizes of the final model; then the best others, most probable first."""
+    """What is claimed, as it was added, with sizes of the final model; then the best others, most probable first.
+
+    Beside several effects that explain the data as well, a size is averaged over these.
+    """
     last = found.rounds[min(len(found.claimed), len(found.rounds)) - 1] if found.claimed else found.rounds[0]
-    mine = []
+    fits = [found.final if any(j is c for c in found.claimed) else j.ranked.fit for j in group]
+    weights = [float(w) for w in softmax([fit.log_evidence for fit in fits])] if group else []
+    shares = {j.named.label: w for j, w in zip(group, weights, strict=True)}
+    # some of them judged anew, beside what was claimed after them
+    anew = any(all(j is not one for of in found.rounds for one in of.judged) for j in group)
+    mine, probabilities = [], dict(last.probabilities)
     for k, j in enumerate(found.claimed):
         of = found.rounds[k]
         # what else is claimed is no alternative to it
@@ -281,13 +287,20 @@ def _candidates(
         else:  # there are none, or it took the place of an earlier claim once others were known
             told = against_nothing(j.hypothesis, j.gain, hypotheses, settings, k)
         sizes = {n: final.get(f"{j.named.label}.{n}", s) for n, s in j.named.sizes.items()}
+        if group and j.named.label not in shares:
+            named = partial(sizes_of, j.hypothesis, j.named.name)
+            beside = [sizes if fit is found.final else named(fit) for fit in fits]
+            sizes = {n: averaged_size([s[n] for s in beside], weights) for n in sizes}
+        elif anew:
+            probabilities |= {label: told * share for label, share in shares.items()}
+            told = probabilities[j.named.label]
         mine.append(replace(_candidate(j, told, True), parameters=sizes))
     taken = {c.label for c in mine}
-    rest = [j for j in last.judged if j.named.label not in taken]
-    rest.sort(key=lambda j: (j not in group, -j.gain))
-    others = [_candidate(j, last.probabilities.get(j.named.label, 0.0), False) for j in rest]
-    others = others[: max(settings.candidates, len(mine) + len(group)) - len(mine)]
-    return (*mine, *sorted(others, key=lambda c: -c.probability))
+    others = {j.named.label: j for j in (*last.judged, *group) if j.named.label not in taken}
+    rest = sorted(others.values(), key=lambda j: (j.named.label not in shares, -j.gain))
+    shown = rest[: max(settings.candidates, len(mine) + len(group)) - len(mine)]
+    told_of = [_candidate(j, probabilities.get(j.named.label, 0.0), False) for j in shown]
+    return (*mine, *sorted(told_of, key=lambda c: -c.probability))
 
 
 def _candidate(j: Judged, probability: float, claimed: bool) -> Candidate:

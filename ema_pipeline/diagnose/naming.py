@@ -100,6 +100,13 @@ def sizes_of(hypothesis: Hypothesis, name: Name, fit: Fit) -> dict[str, EffectSi
     return found
 
 
+def averaged_size(sizes: Sequence[EffectSize], weights: Sequence[float]) -> EffectSize:
+    """One size over several models that are as probable as their weights say."""
+    values, stds = np.array([(s.value, s.std) for s in sizes]).T
+    mean = float(values @ weights)
+    return EffectSize(mean, float(np.sqrt((stds**2 + (values - mean) ** 2) @ weights)), sizes[0].unit)
+
+
 def _unknown(hypothesis: Hypothesis, fit: Fit) -> float:
     p = hypothesis.placed.effect.parameters[0]
     return fit.posterior.value(hypothesis.placed.parameter_name(p.name))

@@ -208,7 +208,9 @@ def record_hypotheses(
     """
     skip = set(known)
     assembly = observations.basis.rig.assembly(observations.configuration)
-    anywhere = _sought_anywhere(library)
+    # sought at every DOF and between any two bodies; what is simplest to say comes first
+    anywhere = [e for e in library.values() if e.generic or e.records_order is not None]
+    anywhere.sort(key=lambda e: (e.records_order is None, e.records_order or 0, e.id))
     ids = {e.id for e in anywhere}
     own = [] if observations.modal else [e for e in library.values() if e.id not in ids]
     placed = [PlacedEffect(e, place) for e in own for place in e.find_places(assembly)]
@@ -226,12 +228,6 @@ def record_hypotheses(
         if change is None or not _spanned(change, loose):
             _grouped(groups, Name(scaled, {}), change)
     return tuple(Hypothesis(tuple(names), begun=size_starts(names[0].placed)) for _, names in groups)
-
-
-def _sought_anywhere(library: Mapping[str, Effect]) -> list[Effect]:
-    """Effects that are sought at every DOF and between any two bodies; what is simplest to say comes first."""
-    found = [e for e in library.values() if e.generic or e.records_order is not None]
-    return sorted(found, key=lambda e: (e.records_order is None, e.records_order or 0, e.id))
 
 
 def _places(observations: RecordObservations) -> tuple[str, ...]:

@@ -207,26 +207,24 @@ def weighed(
     Of the evidence only what is believed counts: verdict and probabilities agree. What rests on close modes is a doubt
     whether anything is missing; among rivals it is evidence like any other for one that is claimed all the same.
     """
-    least = _least_believed(judged, settings)
+    # What contradicts one speaks against rivals far behind it as much: their probability is a small share of its own.
+    least = max((j.gain for j in judged if j.contradicted), default=-np.inf) - settings.alike
     believed = _without_linearisation(ranking, settings) | {j.named.label: j.believed for j in judged}
     told = probabilities(ranking, hypotheses, settings, found, believed, least)
     nothing = doubt_of_nothing(told[NOTHING], settings)
-    doubts = [_against(j, judged, least) or _too_little(j, nothing) if j.claimed else "" for j in judged]
+    doubts = [_against(j, judged, least, nothing) if j.claimed else "" for j in judged]
     judged = [replace(j, doubt=doubt) if doubt else j for j, doubt in zip(judged, doubts, strict=True)]
     among = believed | {j.named.label: j.gain - j.linearisation for j in judged if j.claimed}
     rivals = probabilities(ranking, hypotheses, settings, found, among, least)
     return Round(ranking, tuple(judged), divided_as(rivals, told))
 
 
-def _against(one: Judged, judged: Sequence[Judged], least: float) -> str:
-    """What others say against a claim: it is far behind what is contradicted, or one of many; empty for nothing."""
+def _against(one: Judged, judged: Sequence[Judged], least: float, nothing: str = "") -> str:
+    """Why something is not claimed: far behind what is contradicted, one of many, or `nothing` is too probable."""
     if one.gain < least:
         return BETTER_CONTRADICTED
-    return BETTER_DOUBTED if _one_of_many(one, judged) else ""
-
-
-def _too_little(one: Judged, nothing: str) -> str:
-    """Why nothing is claimed where nothing missing is too probable, with what that rests on; empty where it is not."""
+    if _one_of_many(one, judged):
+        return BETTER_DOUBTED
     return f"{nothing}, and {drops_to(one.left)}" if nothing and one.left < one.gain else nothing
 
 
@@ -249,11 +247,3 @@ def _without_linearisation(ranking: Ranking, settings: DiagnoseSettings) -> dict
         n.label: r.gain + n.advantage - doubtful_evidence(ranking, r.hypothesis, settings)
         for r, n in zip(ranked, names, strict=True)
     }
-
-
-def _least_believed(judged: Sequence[Judged], settings: DiagnoseSettings) -> float:
-    """Gain below which none is believed: far below one that error or held-out data contradict.
-
-    What contradicts the better one speaks against its rivals as much, whose probability is a small share of its own.
-    """
-    return max((j.gain for j in judged if j.contradicted), default=-np.inf) - settings.alike

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from ema_pipeline.diagnose.explained import Explanation, OutlyingDamping, OutlyingPart
+from ema_pipeline.diagnose.explained import Explanation, OutlyingPart
 from ema_pipeline.diagnose.types import NOT_DETERMINED, EffectSize, VerdictWord
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
 from ema_pipeline.inference import LEAST_LIMIT
@@ -41,11 +41,8 @@ def probability_text(p: float) -> str:
 
 def size_text(sizes: Mapping[str, EffectSize]) -> str:
     """``fraction 0.3500 ± 0.0020, …``."""
-    return ", ".join(f"{_own_name(n)} {value_text(s)}" for n, s in sizes.items())
-
-
-def _own_name(name: str) -> str:
-    return part_words(name.rpartition(".")[2]).replace("_", " ")
+    own = {n: part_words(n.rpartition(".")[2]).replace("_", " ") for n in sizes}
+    return ", ".join(f"{own[n]} {value_text(s)}" for n, s in sizes.items())
 
 
 def value_text(s: EffectSize) -> str:
@@ -125,29 +122,25 @@ STANDING_STILL = (
 
 def reasons(found: Explanation, error: float) -> str:
     """Why a model does not explain the data, beside its `error`; empty where there is nothing to add."""
+    alone = (
+        f"The error of the modes alone is {found.by_modes:.2f}: many data of single hits, which fit, hide it."
+    )
+    of_scatters = (
+        "Only a scatter that is larger than usual explains the data: with the usual one the error is "
+        f"{found.by_scatter:.2f}."
+    )
+    of_damping = found.damping and (
+        f"The damping ratios scatter by {100 * found.damping.scatter:.0f} % about the model's (1 σ of ln ζ), more "
+        f"than the {100 * found.damping.usual:.0f} % of structures that lack no damper."
+    )
     told = (
         STANDING_STILL if found.stands_still else "",
-        _of_modes_alone(found.by_modes) if found.by_modes > error else "",
-        _of_usual_scatters(found.by_scatter) if found.by_scatter else "",
-        _of_damping(found.damping) if found.damping else "",
+        alone if found.by_modes > error else "",
+        of_scatters if found.by_scatter else "",
+        of_damping or "",
         standing_out(found.parts),
     )
     return " ".join(filter(None, told))
-
-
-def _of_modes_alone(error: float) -> str:
-    return f"The error of the modes alone is {error:.2f}: many data of single hits, which fit, hide it."
-
-
-def _of_usual_scatters(error: float) -> str:
-    return f"Only a scatter that is larger than usual explains the data: with the usual one the error is {error:.2f}."
-
-
-def _of_damping(found: OutlyingDamping) -> str:
-    return (
-        f"The damping ratios scatter by {100 * found.scatter:.0f} % about the model's (1 σ of ln ζ), more than the "
-        f"{100 * found.usual:.0f} % of structures that lack no damper."
-    )
 
 
 def standing_out(parts: Sequence[OutlyingPart]) -> str:

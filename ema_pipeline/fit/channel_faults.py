@@ -185,7 +185,8 @@ def _factors(frfs: FrfSet, log_ratio: Real, cosine: Real) -> list[_Suspicion]:
     if not known.size:
         return []
     logs = np.array([_weighted_median(log_ratio[o], weight[o]) for o in known])
-    common = _common(logs)
+    middle = float(np.median(logs))  # common where more than half of the channels share it
+    common = middle if np.mean(np.abs(logs - middle) < 2 * math.log(SAME_FACTOR)) > 0.5 else 0.0
     found = []
     if frfs.force_calibrated and abs(common) > math.log(SUSPECT_FACTOR):
         hammer = channels_words([frfs.hammer.name]) if frfs.hammer else "the force channel"
@@ -224,12 +225,6 @@ def _of_one_size(log_ratio: Real, cosine: Real) -> Real:
             logs = logs - _weighted_median(logs, weight)
         own[np.abs(logs) >= math.log(ONE_SIZE)] = np.nan
     return kept
-
-
-def _common(logs: Real) -> float:
-    """The factor that more than half of the channels share, within `SAME_FACTOR` of it; 0 without one."""
-    middle = float(np.median(logs))
-    return middle if np.mean(np.abs(logs - middle) < 2 * math.log(SAME_FACTOR)) > 0.5 else 0.0
 
 
 def _reversed(frfs: FrfSet, cosine: Real) -> list[_Suspicion]:

@@ -94,14 +94,15 @@ def identify_isolator(loops: Sequence[Loop], settings: LoopSettings | None = Non
     s = settings or LoopSettings()
     with single_blas_thread():
         lines = energy_lines(loops, s.significance)
-        several = _several_frequencies(loops)
+        driven = [loop.frequency_hz for loop in loops]
+        several = max(driven) > 1.02 * min(driven)
         effects = [e for e in SOURCE_MODEL if several or e != "viscous_damping"]
         together = LoopObservations(isolator(), loops)
         published = Published.fitted(together, effects)
         parameters = published.estimates(s.significance)
         if not several:
             parameters[DAMPING] = Estimate(float("nan"), float("nan"), UNITS[DAMPING], False, ONE_FREQUENCY)
-        flags = [f"{_frequencies(line.frequency_hz)} at {_mm(line.amplitude_m)}: {line.reason}"
+        flags = [f"{_frequencies(line.frequency_hz)} at {1e3 * line.amplitude_m:.3g} mm: {line.reason}"
                  for line in lines if not line.possible]  # fmt: skip
         flags += _giving(loops, s.significance) + _impossible(parameters, s.significance)
         relaxation: dict[str, Estimate] = {}
@@ -306,15 +307,6 @@ def _loss_factors(loops: Sequence[Loop], published: Published) -> tuple[LossFact
         relative = np.hypot(stored_std / stored, loop.energy_std_j / max(abs(loop.energy_j), 1e-300))
         found.append(LossFactor(loop.name, loop.frequency_hz, x, float(eta), float(abs(eta) * relative)))
     return tuple(found)
-
-
-def _several_frequencies(loops: Sequence[Loop]) -> bool:
-    f = [loop.frequency_hz for loop in loops]
-    return max(f) > 1.02 * min(f)
-
-
-def _mm(amplitude_m: float) -> str:
-    return f"{1e3 * amplitude_m:.3g} mm"
 
 
 def _frequencies(f: NDArray[np.float64]) -> str:

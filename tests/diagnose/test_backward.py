@@ -71,37 +71,50 @@ def test_a_linear_claim_goes_once_a_law_at_its_place_is_claimed(
         assert found == claimed
 
 
-def test_rivals_of_an_early_claim_are_held_against_it_with_the_later_ones_known(
+def test_rivals_of_an_early_claim_are_judged_anew_with_the_later_ones_known(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Of one claim nothing is fitted again; what is claimed itself is no rival."""
-    mass, spring, other, far = (
-        SimpleNamespace(hypothesis=hypothesis(name))
-        for name in ("mass@q3", "spring@q1", "mass@q3.x", "mass@all")
+    """Of one claim nothing is fitted again; what is claimed itself is no rival; what was far behind may be one."""
+    mass, spring, other, far, behind = (
+        SimpleNamespace(hypothesis=hypothesis(name), ranked=name)
+        for name in ("mass@q3", "spring@q1", "mass@q3.x", "mass@all", "mass@q2")
     )
-    near = {"mass@q3": (mass, other, far, spring), "spring@q1": (spring, mass)}
-    rounds: Any = {name: SimpleNamespace(alike=lambda s, name=name: near[name]) for name in near}
-    evidence = {"mass@q3.x": 99.0, "mass@all": 40.0}
+    near = {"mass@q3": (mass, other, spring), "spring@q1": (spring, mass)}
+    judged = {"mass@q3": (mass, other, spring, far, behind), "spring@q1": (spring, mass)}
+    rounds: Any = {
+        name: SimpleNamespace(alike=lambda s, name=name: near[name], judged=judged[name]) for name in near
+    }
+    evidence = {"mass@q3.x": 99.0, "mass@all": 40.0, "mass@q2": 98.5, "": 30.0}
     asked: list[list[str]] = []
 
-    def fitted(observations: object, known: object, effects: Any, final: object, rival: Any) -> Any:
+    def fitted(observations: object, known: object, effects: Any, final: object, rival: Any = None) -> Any:
         asked.append([h.label for h in effects])
-        return SimpleNamespace(log_evidence=evidence[rival.hypothesis.label])
+        posterior = SimpleNamespace(log_evidence=evidence["" if rival is None else rival.hypothesis.label])
+        return SimpleNamespace(posterior=posterior, log_evidence=posterior.log_evidence)
+
+    def anew(observations: object, ranking: Any, ranked: Any, settings: object) -> Any:
+        assert ranking.base.log_evidence == 30.0  # the other claims without any of these
+        label, gain = ranked
+        return SimpleNamespace(hypothesis=hypothesis(label), gain=gain)
 
     monkeypatch.setattr(backward, "_fitted", fitted)
+    monkeypatch.setattr(backward, "_with", lambda known, effects: None)
+    monkeypatch.setattr(backward, "replace", lambda label, fit, gain: (label, gain))
+    monkeypatch.setattr(backward, "judge", anew)
     settings: Any = SimpleNamespace(processes=1, alike=3.0)
     nothing: Any = None
     final: Any = SimpleNamespace(log_evidence=100.0)
 
     def told(*claimed: Any) -> list[list[str]]:
-        found = alike_beside(nothing, nothing, claimed, rounds, final, settings)
-        return [[j.hypothesis.label for j in group] for group in found]
+        groups = alike_beside(nothing, nothing, claimed, rounds, final, settings)
+        assert [j.gain for group in groups for j in group[1:] if hasattr(j, "gain")] in ([], [69.0, 68.5])
+        return [[j.hypothesis.label for j in group] for group in groups]
 
-    assert told(mass, spring) == [["mass@q3", "mass@q3.x"], ["spring@q1"]]
-    assert asked == [["mass@q3.x", "spring@q1"], ["mass@all", "spring@q1"]]
+    assert told(mass, spring) == [["mass@q3", "mass@q3.x", "mass@q2"], ["spring@q1"]]
+    assert asked == [["spring@q1"], *([name, "spring@q1"] for name in ("mass@q3.x", "mass@all", "mass@q2"))]
     asked.clear()
-    assert told(mass) == [["mass@q3", "mass@q3.x", "mass@all", "spring@q1"]]
+    assert told(mass) == [["mass@q3", "mass@q3.x", "spring@q1"]]
     assert not asked
     again: Any = SimpleNamespace(hypothesis=mass.hypothesis)  # judged anew, after the spring
-    assert told(spring, again) == [["spring@q1"], ["mass@q3", "mass@q3.x"]]
-    assert asked == [["spring@q1", "mass@q3.x"], ["spring@q1", "mass@all"]]
+    assert told(spring, again) == [["spring@q1"], ["mass@q3", "mass@q3.x", "mass@q2"]]
+    assert asked == [["spring@q1"], *(["spring@q1", name] for name in ("mass@q3.x", "mass@all", "mass@q2"))]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ema_pipeline.diagnose import probability, rounds, selection
+from ema_pipeline.diagnose import diagnosis, probability, rounds, selection
 from ema_pipeline.diagnose.claims import (
     BETTER_CONTRADICTED,
     BETTER_DOUBTED,
@@ -45,7 +45,7 @@ def judged(
         id=effect_id, title=f"title of {label}", signs="signs", linear=linear, generic=generic
     )
     placed = SimpleNamespace(effect=effect, place=place, label=label)
-    fit = SimpleNamespace(model=f"model of {label}")
+    fit = SimpleNamespace(model=f"model of {label}", log_evidence=100.0 + gain)
     hypothesis = SimpleNamespace(label=label, generic=generic, placed=placed)
     return SimpleNamespace(
         hypothesis=hypothesis,
@@ -346,6 +346,7 @@ def test_an_effect_that_cannot_be_claimed_alone_is_claimed_where_it_holds_with_a
         "fit_base",
         lambda o, m, start=None: SimpleNamespace(model=m, log_evidence=100.0, posterior=None),
     )
+    monkeypatch.setattr(selection, "alike_beside", lambda *given: ())
     found = steps.select([j.hypothesis for j in (a, rival, b, c)], SETTINGS, [])
     assert asked == ([] if second_doubt else [21.0])
     assert [j.hypothesis.label for j in found.claimed] == (["a@x", "b@x"] if holds else [])
@@ -743,7 +744,8 @@ def test_no_more_effects_are_added_than_may_be(monkeypatch: pytest.MonkeyPatch) 
 def selected(claimed: list[Any], *rounds: Round) -> Selection:
     nothing: Any = None
     alike_claims = tuple(of.alike(SETTINGS) for _, of in zip(claimed, rounds, strict=False))
-    return Selection(tuple(rounds), tuple(claimed), nothing, nothing, alike_claims)
+    final: Any = claimed[-1].ranked.fit if claimed else None
+    return Selection(tuple(rounds), tuple(claimed), final, nothing, alike_claims)
 
 
 def test_how_the_search_ended() -> None:
@@ -755,7 +757,10 @@ def test_how_the_search_ended() -> None:
     assert told == "the best further effect is spring at m2, and it gains little"
 
 
-def test_candidates_are_the_claimed_ones_with_final_sizes_then_the_group_then_the_rest() -> None:
+def test_candidates_are_the_claimed_ones_with_final_sizes_then_the_group_then_the_rest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Beside one of the group the size of another claim differs: it is averaged over the group."""
     a, b = judged("a@x", 20.0), judged("b@x", 9.0)
     alike, rest = judged("c@x", 7.0, "held-out"), judged("d@x", 8.0, "weak")
     first = a_round(a, told={"a@x": 0.9, "b@x": 0.05})
@@ -763,11 +768,20 @@ def test_candidates_are_the_claimed_ones_with_final_sizes_then_the_group_then_th
     third = a_round(judged("e@x", 1.0, "none"), told={"e@x": 0.1})
     final = {"a@x.size": EffectSize(5.0, 0.5, "N"), "b@x.size": EffectSize(6.0, 0.6, "N")}
     hypotheses: Any = [j.hypothesis for j in (a, b, alike, rest)]
+
+    def sizes_of(of: object, name: object, fit: object) -> dict[str, EffectSize]:
+        assert (of, fit) == (a.hypothesis, alike.ranked.fit)
+        return {"size": EffectSize(7.0, 0.3, "N")}
+
+    monkeypatch.setattr(diagnosis, "sizes_of", sizes_of)
+    share = 1 / (1 + np.exp(2.0))  # two behind in log evidence
     found = _candidates(selected([a, b], first, second, third), SETTINGS, (b, alike), hypotheses, final)
     assert [(c.label, c.claimed, c.probability) for c in found] == [
         ("a@x", True, pytest.approx(0.9 / 0.95)), ("b@x", True, 0.8), ("c@x", False, 0.15), ("d@x", False, 0.01)
     ]  # fmt: skip
-    assert [c.parameters["size"].value for c in found] == [5.0, 6.0, 7.0, 8.0]
+    assert [c.parameters["size"].value for c in found] == [pytest.approx(5.0 + 2.0 * share), 6.0, 7.0, 8.0]
+    spread = (1 - share) * 0.5**2 + share * 0.3**2 + share * (1 - share) * 2.0**2
+    assert found[0].parameters["size"].std == pytest.approx(np.sqrt(spread))
     assert found[0].why == "Its signs: signs."
     assert found[2].why == "Not claimed: held-out."
     one = found[1]
@@ -782,6 +796,22 @@ def test_candidates_are_the_claimed_ones_with_final_sizes_then_the_group_then_th
     four = _candidates(selected([a, b], first, second, third), few, (b, alike), hypotheses, final)
     assert len(four) == 4
     assert len(_candidates(selected([a, b], first, second, third), few, (), hypotheses, final)) == 2
+
+
+def test_what_explains_the_data_in_the_place_of_an_early_claim_shares_its_probability(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In its own round it was far behind; with its size from there it would be told wrongly."""
+    a, b = judged("a@x", 20.0), judged("b@x", 9.0)
+    instead = judged("c@x", 7.0)  # judged anew, beside b: two behind in log evidence
+    first, second = a_round(a, judged("c@x", 1.0, "far"), told={"a@x": 0.99}), a_round(b, told={"b@x": 0.9})
+    monkeypatch.setattr(diagnosis, "sizes_of", lambda of, name, fit: {"size": EffectSize(9.0, 0.1, "N")})
+    hypotheses: Any = [j.hypothesis for j in (a, b, instead)]
+    found = _candidates(selected([a, b], first, second), SETTINGS, (a, instead), hypotheses, {})
+    told = 0.99 / np.array([1 + np.exp(-2.0), 1 + np.exp(2.0)])
+    assert [(c.label, c.claimed) for c in found] == [("a@x", True), ("b@x", True), ("c@x", False)]
+    assert [c.probability for c in found] == pytest.approx([told[0], 0.9, told[1]])
+    assert found[2].parameters["size"].value == 7.0
 
 
 def test_what_took_the_place_of_the_first_leader_has_its_probability() -> None:
