@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -17,8 +17,8 @@ from ema_pipeline.mechanics.terms import assemble_terms
 from ema_pipeline.observations.size_map import SizeMap
 from ema_pipeline.rigs.types import Rig
 
-_SAME = 1 - 1e-9
-"""Correlation of two changes of all matrices from which they are the same physics."""
+SAME_PHYSICS = 1 - 1e-9
+"""Correlation of two changes of what is calculated from which they are the same physics."""
 _MOST_STARTS = 4
 _LOG_STARTS = (-1.0, 0.4, 1.5)
 """Unknowns of yields, times and the like from which fits begin: a factor of about four apart."""
@@ -121,6 +121,10 @@ def _starts_of(unit: str, size: SizeMap) -> tuple[float, ...]:
     return (0.3, 2.0) if low == 0.0 else (0.5, -0.5)
 
 
+Groups = list[tuple[NDArray[np.float64] | None, list[Name]]]
+"""Changes of what is calculated, and the effects that bring them; None where one is not in proportion to a size."""
+
+
 def list_hypotheses(
     rig: Rig,
     library: Mapping[str, Effect],
@@ -166,7 +170,7 @@ def _names(
 def _merged(names: Sequence[Name], assemblies: Mapping[str, Assembly]) -> list[Hypothesis]:
     """Names whose changes of all matrices are proportional to each other, or which add the same nonlinear elements, as
     one hypothesis."""
-    groups: list[tuple[NDArray[np.float64] | None, list[Name]]] = []
+    groups: Groups = []
     nonlinear: dict[object, list[Name]] = {}
     for name in names:
         if (added := _added(name, assemblies)) is not None:
@@ -175,18 +179,24 @@ def _merged(names: Sequence[Name], assemblies: Mapping[str, Assembly]) -> list[H
             nonlinear[added].append(name)
             continue
         change = _change(name, assemblies)
-        if change is not None and not np.any(change):
-            continue
-        size = 0.0 if change is None else float(np.linalg.norm(change))
-        for known, members in groups:
-            if known is not None and change is not None and known.shape == change.shape:
-                reference = float(np.linalg.norm(known))
-                if float(known @ change) > _SAME * reference * size:
-                    members.append(Name(name.placed, name.scales, size / reference))
-                    break
-        else:
-            groups.append((change, [name]))
+        if change is None or np.any(change):
+            put_among(groups, name, change)
     return [Hypothesis(tuple(members)) for _, members in groups]
+
+
+def put_among(
+    groups: Groups, name: Name, change: NDArray[np.float64] | None, same: float = SAME_PHYSICS
+) -> None:
+    """Put an effect beside those whose changes its own is in proportion to, or after all where there are none."""
+    size = 0.0 if change is None else float(np.linalg.norm(change))
+    for known, names in groups:
+        if known is None or change is None or known.shape != change.shape:
+            continue
+        reference = float(np.linalg.norm(known))
+        if float(known @ change) > same * reference * size:
+            names.append(replace(name, relative=size / reference))
+            return
+    groups.append((change, [name]))
 
 
 def _added(name: Name, assemblies: Mapping[str, Assembly]) -> object | None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.diagnosis import diagnose
-from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, size_starts
+from ema_pipeline.diagnose.hypotheses import Groups, Hypothesis, Name, put_among, size_starts
 from ema_pipeline.diagnose.selection import Progress
 from ema_pipeline.diagnose.sentences import label_text, size_text, summary
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -38,8 +38,6 @@ _TOLD = 2.0
 """Standard deviations by which a further loop would have to tell two models apart."""
 _FREE = 0.4
 """Prior 1 σ of the logarithm of a family from which the loops determine it."""
-_SAME = 1 - 1e-9
-"""Correlation of two changes of the force from which they are the same physics."""
 
 
 def diagnose_loops(
@@ -105,7 +103,7 @@ def loop_hypotheses(
     groups: Groups = [(column, []) for column in free]
     for placed in _placed(observations, library):
         if placed.label not in skip and observations.isolator.shows(observations.rig, placed):
-            _grouped(groups, Name(placed, {}), _change(observations, placed))
+            put_among(groups, Name(placed, {}), _change(observations, placed))
     return tuple(
         Hypothesis(tuple(names), begun=size_starts(names[0].placed))
         for k, (_, names) in enumerate(groups)
@@ -118,22 +116,6 @@ def _placed(observations: LoopObservations, library: Mapping[str, Effect]) -> li
     assembly = observations.rig.assembly(observations.isolator.configuration)
     own = sorted((e for e in library.values() if not e.records_only), key=lambda e: e.generic)
     return [observations.scaled(PlacedEffect(e, place)) for e in own for place in e.find_places(assembly)]
-
-
-Groups = list[tuple[NDArray[np.float64] | None, list[Name]]]
-"""Changes of the force, and the effects that bring them."""
-
-
-def _grouped(groups: Groups, name: Name, change: NDArray[np.float64] | None) -> None:
-    size = 0.0 if change is None else float(np.linalg.norm(change))
-    for known, names in groups:
-        if known is None or change is None:
-            continue
-        reference = float(np.linalg.norm(known))
-        if float(known @ change) > _SAME * reference * size:
-            names.append(dataclasses.replace(name, relative=size / reference))
-            return
-    groups.append((change, [name]))
 
 
 def _change(observations: LoopObservations, placed: PlacedEffect) -> NDArray[np.float64] | None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.diagnosis import diagnose
-from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, size_starts
+from ema_pipeline.diagnose.hypotheses import Groups, Hypothesis, Name, put_among, size_starts
 from ema_pipeline.diagnose.probability import CLOSEST, shared
 from ema_pipeline.diagnose.rungs import (
     learned_scatters,
@@ -219,14 +219,14 @@ def record_hypotheses(
             if effect.fits(assembly, place) and not (observations.modal and effect.linear):
                 placed.append(PlacedEffect(effect, place))
     loose = _loose_columns(observations)
-    groups: list[tuple[NDArray[np.float64] | None, list[Name]]] = []
+    groups: Groups = []
     for one in placed:
         if one.label in skip or not _can_be_simulated(observations, one):
             continue
         scaled = observations.scaled(one)
         change = _linear_change(observations, scaled)
         if change is None or not _spanned(change, loose):
-            _grouped(groups, Name(scaled, {}), change)
+            put_among(groups, Name(scaled, {}), change, 1 - _SAME_CHANGE)
     return tuple(Hypothesis(tuple(names), begun=size_starts(names[0].placed)) for _, names in groups)
 
 
@@ -423,20 +423,3 @@ def _spanned(change: NDArray[np.float64], loose: NDArray[np.float64]) -> bool:
         return True
     factors = np.linalg.lstsq(loose, change, rcond=1e-12)[0]
     return float(np.linalg.norm(change - loose @ factors)) < _SAME_CHANGE * float(np.linalg.norm(change))
-
-
-def _grouped(
-    groups: list[tuple[NDArray[np.float64] | None, list[Name]]],
-    name: Name,
-    change: NDArray[np.float64] | None,
-) -> None:
-    """Put an effect beside those of the same physics."""
-    size = 0.0 if change is None else float(np.linalg.norm(change))
-    for known, names in groups:
-        if known is None or change is None:
-            continue
-        reference = float(np.linalg.norm(known))
-        if float(known @ change) > (1 - _SAME_CHANGE) * reference * size:
-            names.append(dataclasses.replace(name, relative=size / reference))
-            return
-    groups.append((change, [name]))

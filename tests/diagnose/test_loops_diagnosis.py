@@ -15,11 +15,10 @@ from typer.testing import CliRunner
 
 from ema_pipeline import codec
 from ema_pipeline.cli import app
-from ema_pipeline.diagnose.hypotheses import Name
+from ema_pipeline.diagnose.hypotheses import Name, put_among
 from ema_pipeline.diagnose.loops import (
     Fitted,
     _extreme,
-    _grouped,
     _next_loop,
     _setting_words,
     diagnose_loops,
@@ -329,7 +328,7 @@ def test_effects_of_the_same_force_are_names_of_one_with_their_relative_size() -
     other = np.array([1.0, 2.0, 1e-3])
     names = [Name(parse_effect("damper@mass.x", isolator()), {}) for _ in range(5)]
     for name, change in zip(names, (row, 3 * row, None, -row, other), strict=True):
-        _grouped(groups, name, change)
+        put_among(groups, name, change)
     assert [[n.relative for n in mine] for _, mine in groups] == [
         [1.0, pytest.approx(3.0)],
         [1.0],
