@@ -91,10 +91,17 @@ class Tried:
         Of the size.
     gain : float
         By how much the cost falls, at wide uncertainties, or that of modes without a partner, if this is more.
+    pairs : float
+        By how much the cost of modes without a partner falls, at plain uncertainties, with one of `tuned`.
+    tuned : tuple of float
+        Other sizes, which give a mode of the model the frequency of a measured one. Where nominal modes coincide, their
+        shapes lie as they happen to, and other costs hardly tell sizes apart.
     """
 
     unknown: float
     gain: float
+    pairs: float = 0.0
+    tuned: tuple[float, ...] = ()
 
 
 def tried_sizes(
@@ -135,15 +142,18 @@ def tried_sizes(
         if unknowns.clipped(at_size(0.0))[at]:  # it has no size of nothing
             return Tried(0.0, -np.inf)
         without = compared(0.0)
-        sizes = [*_SIZES, *problem.tuned(begin, unknowns.names[at])]
-        sizes = [size for size in sizes if unknowns.clipped(at_size(size))[at] == size]
+        tuned = [s for s in problem.tuned(begin, unknowns.names[at]) if unknowns.clipped(at_size(s))[at] == s]
+        sizes = [s for s in _SIZES if unknowns.clipped(at_size(s))[at] == s] + tuned
         fewer = [s for s in sizes if problem.unpaired(at_size(s), scatters, _GRID_HEAT) < without.penalty]
         if not fewer:
             return Tried(0.0, -np.inf)
         least, size = min((compared(s).cost, s) for s in fewer)
         # what turns coinciding modes of nominal parts into each other, or apart, is no worse for that
         gain = max(without.cost, compared(_SMALLEST).cost) - least
-        return Tried(size, max(gain, without.penalty - compared(size).penalty))
+        before, *after = (problem.unpaired(at_size(s), scatters, 1.0) for s in (0.0, *tuned))
+        pairs = before - min(after, default=before)
+        best_tuned = tuple(s for s, cost in zip(tuned, after, strict=True) if cost == before - pairs)
+        return Tried(size, max(gain, without.penalty - compared(size).penalty), pairs, best_tuned)
 
     found = zip(asked, spread(best, asked, processes), strict=True)
     return {h.label: tried for h, tried in found if tried.gain > 0}
@@ -199,7 +209,12 @@ def annealed_fit(
     starts = _starts(observations, problem, hypothesis, begin, promise.get(label), tried.get(label), near)
     if base.posterior.residuals.unexplained and not hypothesis.size_cannot_be_zero:
         starts += _from_nominal(problem, hypothesis, begin)
-    return annealed(observations, model, starts, schedule).posterior
+    found = [annealed(observations, model, starts, schedule)]
+    if label in tried and tried[label].tuned:  # apart: while hot, sizes that do nothing cost less
+        unbent, name = _unbent(problem.unknowns, begin), _first_size(hypothesis)
+        starts = [problem.unknowns.with_values(unbent, {name: size}) for size in tried[label].tuned]
+        found.append(annealed(observations, model, starts, schedule))
+    return max((fit.posterior for fit in found), key=lambda p: p.log_evidence)
 
 
 def continued_fit(

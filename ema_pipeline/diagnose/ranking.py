@@ -195,8 +195,10 @@ def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], ne
 
 
 def _best_tried(tried: Mapping[str, Tried], most: int) -> set[str]:
-    """Hypotheses of which some size gives modes without a partner one, the best of them."""
-    return set(sorted(tried, key=lambda label: -tried[label].gain)[:most])
+    """Hypotheses of which some size gives modes without a partner one: the best of them, and those that pair most."""
+    pairing = [label for label, one in tried.items() if one.pairs > 0]
+    most_pairing = sorted(pairing, key=lambda label: (-tried[label].pairs, -tried[label].gain))[:most]
+    return {*sorted(tried, key=lambda label: -tried[label].gain)[:most], *most_pairing}
 
 
 def _batches(

@@ -23,6 +23,9 @@ from ema_pipeline.observations.parts import DAMPING_SCATTER
 UNEXPLAINED = 18.0
 """Cost, in the log posterior, of a measured mode without a model mode: of some 1,400 that were identified in studies of
 simulated tests none was invented."""
+UNEXPLAINED_SENSOR, _MOST_SENSORS = 2.0, 5
+"""What every sensor beyond two adds to that, up to so many: its entry agrees with that of a wrong partner by chance
+only. An explained mode pays about as much for what it tells of calibration and parts."""
 UNEXPLAINED_DOUBLE = 12.0
 """The same of one whose shape is a mix of its neighbours': drift may have split it off."""
 UNEXPLAINED_PRODUCT = 5.0
@@ -83,7 +86,9 @@ class Alone:
             sure = alone[~data.doubtful[alone]]
             doubles = int(np.sum(data.double[alone]))
             split = UNEXPLAINED_DOUBLE * doubles + UNEXPLAINED_PRODUCT * (len(alone) - len(sure) - doubles)
-            penalty = UNEXPLAINED * len(sure) + split + _credited(data, sure, scatters, defaults)
+            further = np.clip(np.sum(np.isfinite(data.shapes[sure]), axis=1) - 2, 0, _MOST_SENSORS)
+            penalty = UNEXPLAINED * len(sure) + UNEXPLAINED_SENSOR * float(np.sum(further)) + split
+            penalty += _credited(data, sure, scatters, defaults)
             known[key] = cls(len(sure), split, penalty, _usual(data, alone, scatters, defaults))
         return known[key]
 

@@ -256,11 +256,39 @@ def test_sizes_that_give_modes_a_partner_are_tried_as_well(monkeypatch: pytest.M
 
     def tuned(x: np.ndarray, name: str) -> list[float]:
         asked.append((x.tolist(), name))
-        return [-20.0, 5.7]
+        return [-20.0, 5.7, 4.0, 6.0, 9.5]  # of which the first and the last are beyond its range
+
+    def unpaired(x: np.ndarray, scatters: object, heat: float) -> float:
+        """Two modes, one of which has a partner from 5; more uncertainty gives both one."""
+        assert heat in (1.0, 30.0)
+        return (PENALTY if x[1] < 5.0 else 0.0) + (9.0 if heat == 1.0 else 0.0)
 
     monkeypatch.setattr(problem, "tuned", tuned)
-    assert tried_of(problem).unknown == 5.7
+    monkeypatch.setattr(problem, "unpaired", unpaired)
+    found = tried_of(problem)
+    assert found.unknown == 5.7
+    assert (found.pairs, found.tuned) == (PENALTY, (5.7, 6.0))
     assert asked == [([0.0, 0.0], "a.s1")]
+
+
+def test_sizes_that_give_modes_a_partner_are_annealed_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While hot, sizes that do nothing cost less, and would win the race."""
+    base = with_model("base", Parabola(("part",), ()), [0.4])
+    model = with_model("a", Parabola(("part", "a.s1"), ("a.s1",)), [0.0, 0.0]).model
+    raced: list[Any] = []
+
+    def annealed(observations: object, model: Any, starts: Any, schedule: object) -> Any:
+        raced.append([x.tolist() for x in starts])
+        return fit("a", float(len(raced)))
+
+    monkeypatch.setattr(first_fits, "annealed", annealed)
+    known = {"a": Tried(0.003, 9.0, PENALTY, (1.2, 1.5))}
+    found = annealed_fit(NO_DATA, base, {"a": model}, {}, known, hypothesis("a"))
+    assert raced[1:] == [[[0.0, 1.2], [0.0, 1.5]]]
+    assert found.log_evidence == 2.0
+    raced.clear()
+    annealed_fit(NO_DATA, base, {"a": model}, {}, {"a": Tried(0.003, 9.0)}, hypothesis("a"))
+    assert len(raced) == 1
 
 
 def test_one_fit_begins_at_the_best_of_the_sizes_that_were_tried() -> None:

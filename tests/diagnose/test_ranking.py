@@ -100,6 +100,9 @@ def test_what_promises_most_is_fitted_first_and_the_rest_in_a_few_steps_once_all
 def test_what_gives_a_lost_mode_a_partner_is_fitted_though_its_score_promises_nothing() -> None:
     tried = {f"h{k}": Tried(8.0, float(k)) for k in range(20)}
     assert _best_tried(tried, 8) == {f"h{k}" for k in range(12, 20)}
+    # costs tell little where nominal modes coincide: partners at plain uncertainties count as well
+    tried |= {"h2": Tried(8.0, 2.0, 18.0), "h3": Tried(8.0, 3.0, 39.0), "h1": Tried(8.0, 1.0, 39.0)}
+    assert _best_tried(tried, 2) == {"h18", "h19", "h3", "h1"}
 
 
 def test_the_search_ends_where_one_hypothesis_explains_all() -> None:

@@ -45,6 +45,7 @@ from ema_pipeline.observations.without_partner import (
     UNEXPLAINED,
     UNEXPLAINED_DOUBLE,
     UNEXPLAINED_PRODUCT,
+    UNEXPLAINED_SENSOR,
     UNSEEN,
     Alone,
     unseen,
@@ -714,7 +715,8 @@ def test_a_mode_that_the_model_lacks_and_one_that_was_not_measured_cost_what_the
     )
     problem = observed(chain(), {"all": twice}).problem((), {})
     found = problem.residuals(np.zeros(len(problem.unknowns)), scatters)
-    assert (found.penalty, found.unexplained, found.split) == (UNEXPLAINED, 1, 0.0)
+    # five sensors read it
+    assert (found.penalty, found.unexplained, found.split) == (UNEXPLAINED + 3 * UNEXPLAINED_SENSOR, 1, 0.0)
     assert [r.measured for r in problem.rows(found)] == [0, 1, 2, 3, 4]
     marked = [replace(d, product=np.arange(len(d)) == 5) for d in problem.observations.data]
     of_levels = problem.observations.with_data(marked).problem((), {})

@@ -76,12 +76,12 @@ class Parabola:
 
     def residuals(self, x: np.ndarray, scatters: object, **how: Any) -> Residuals:
         assert how == {"heat": 30.0, "derivatives": False}
-        lost = self.partner_from is not None and x[-1] / self.partner_from < 1
-        penalty = PENALTY if lost else 0.0
+        penalty = self.unpaired(x, scatters, 30.0)
         return Residuals((x - self.at) / how["heat"], np.zeros((0, len(x))), penalty=penalty)
 
     def unpaired(self, x: np.ndarray, scatters: object, heat: float) -> float:
-        return self.residuals(x, scatters, heat=heat, derivatives=False).penalty
+        lost = self.partner_from is not None and x[-1] / self.partner_from < 1
+        return PENALTY if lost else 0.0
 
     def begun(self, x: np.ndarray, scatters: object) -> list[np.ndarray]:
         return []
