@@ -34,6 +34,9 @@ _AT_LEAST = 3
 _TIED, _MOST = 3.0, 12
 """Log evidence behind the best within which others may be as good at learned scatters, and how many are finalists then:
 in a gear train of which one mode was lifted from 0 Hz, eleven springs lay within 2.7."""
+_LINEAR = 2
+"""The best linear effects are finalists among whatever others: a planet's bearing that gained 73 was thirteenth, behind
+cubic springs, and explained all at learned scatters."""
 PROMISING = 1.0
 """Log evidence that is something: a third of what a claim needs."""
 _FURTHER = 3
@@ -60,7 +63,12 @@ def leading(order: Sequence[tuple[Hypothesis, Fit]], base: Fit) -> list[tuple[Hy
     gaining = [pair for pair in order[_AT_LEAST:FINALISTS] if pair[1].log_evidence > base.log_evidence]
     least = max([base.log_evidence + PROMISING, *(fit.log_evidence - _TIED for _, fit in order[:1])])
     tied = [pair for pair in order[FINALISTS:_MOST] if pair[1].log_evidence > least]
-    return [*order[:_AT_LEAST], *gaining, *tied]
+    # laws at many places that gain alike leave room for what gains most beside them
+    linear = [
+        pair for pair in order if pair[0].placed.effect.linear and pair[1].log_evidence > base.log_evidence
+    ]
+    best = [*order[:_AT_LEAST], *gaining, *tied]
+    return [*best, *(pair for pair in linear[:_LINEAR] if not any(pair is one for one in best))]
 
 
 def promising_fits(

@@ -38,12 +38,12 @@ def trend_words(
 
 
 def one_level(study: LevelStudy, modal: ModalModel) -> str:
-    """What can be said from hits that are all about as hard."""
+    """What can be said from hits of one force level."""
     advice = (
         "To know more, strike every point at two or three forces, each at least twice the last, and two or more "
         "times at each."
     )
-    about = f"All hits are about as hard ({study.levels[0].label})"
+    about = f"All hits are of one force level (about {study.levels[0].label})"
     moving = [m for m in study.modes if m.depends]
     tested = [m for m in study.modes if np.isfinite(m.frequency_p)]
     if moving:

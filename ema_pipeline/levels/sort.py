@@ -22,6 +22,10 @@ SCATTER_DOF = 2.0
 
 MOST_LEVELS = 8
 
+MEANT = 0.85
+"""Share of the pairs of point and level that have a hit, from which levels were meant. Two hits at each of five points,
+of 60 to 180 N as they happened to be, made two levels that three points had both of."""
+
 
 def sort_levels(points: Sequence[str], forces_n: Sequence[float], level_ratio: float) -> Integers:
     """Sort hits into force levels.
@@ -39,7 +43,8 @@ def sort_levels(points: Sequence[str], forces_n: Sequence[float], level_ratio: f
     -------
     ndarray of int, (n_hits,)
         Level of every hit, 0 for the softest; all 0 where no point was struck at two levels, since then
-        points would be compared instead of forces.
+        points would be compared instead of forces, or where they came about by chance: most points were struck at some
+        levels only, and none twice at each of two.
 
     Notes
     -----
@@ -53,8 +58,10 @@ def sort_levels(points: Sequence[str], forces_n: Sequence[float], level_ratio: f
     direct = _clusters(log_force, float(np.log(level_ratio)))
     relative = _clusters(log_force - mean[place], float(np.log(level_ratio)))
     levels = direct if _filled(place, direct) >= _filled(place, relative) else relative
-    struck_twice = any(len(set(levels[place == p])) > 1 for p in range(len(mean)))
-    return levels if struck_twice else np.zeros(len(levels), dtype=np.int64)
+    hits = [np.unique(levels[place == p], return_counts=True)[1] for p in range(len(mean))]
+    at_two = any(len(count) > 1 for count in hits)
+    meant = _filled(place, levels) >= MEANT or any(np.sum(count > 1) > 1 for count in hits)
+    return levels if at_two and meant else np.zeros(len(levels), dtype=np.int64)
 
 
 def _filled(place: Integers, levels: Integers) -> float:

@@ -243,7 +243,7 @@ class LevelStudy:
     Attributes
     ----------
     levels : tuple of ForceLevel
-        From the softest hits up; one entry where all hits are about as hard.
+        From the softest hits up; one entry where all are of one level.
     inputs : tuple of Dof
         Impact points.
     modes : tuple of ModeLevels

@@ -105,7 +105,7 @@ def test_volts_of_an_uncalibrated_hammer_are_shown_as_volts(
     assert code == 0, err
     code, out, err = ema(capsys, "levels", tmp_path / "out")
     assert code == 0, err
-    assert re.search(r"about as hard \(0\.\d+ V\)", out)
+    assert re.search(r"one force level \(about 0\.\d+ V\)", out)
 
 
 def test_a_setting_in_the_wrong_table_is_found(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -42,3 +42,16 @@ def test_forces_closer_than_the_ratio_asked_for_are_one_level() -> None:
     forces = [100, 101, 180, 181]
     assert sort_levels(list("aaaa"), forces, 1.5).tolist() == [0, 0, 1, 1]
     assert sort_levels(list("aaaa"), forces, 2.0).tolist() == [0, 0, 0, 0]
+
+
+def test_forces_of_one_level_that_fall_into_two_by_chance_are_one() -> None:
+    """Hits of an unpractised hand on a linear rig; as many meant for two levels, or a point struck twice at each."""
+    points = ["carrier.x"] * 2 + ["sun.y"] * 2 + ["sun.u"] * 2 + ["planet1.x"] * 2 + ["planet2.y"] * 2
+    chance = [131.0, 171.0, 61.0, 136.0, 141.0, 135.0, 118.0, 63.0, 77.0, 180.0]
+    assert not np.any(sort_levels(points, chance, 1.8))
+    meant = [61.0, 171.0, 61.0, 136.0, 70.0, 135.0, 63.0, 118.0, 77.0, 180.0]
+    np.testing.assert_array_equal(sort_levels(points, meant, 1.8), [0, 1] * 5)
+    once_more = [*points, "planet2.y", "planet2.y"]
+    np.testing.assert_array_equal(
+        sort_levels(once_more, [*chance, 75.0, 175.0], 1.8), [1, 1, 0, 1, 1, 1, 1, 0, 0, 1, 0, 1]
+    )
