@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from written_fits import NO_DATA, Parabola, fit, found_of, hypothesis, with_model
+from written_fits import NO_DATA, Parabola, fit, found_of, hypothesis, law, with_model
 
 from ema_pipeline.diagnose import finals
 from ema_pipeline.diagnose.finals import (
     _crossed,
     finals_of,
     known_from,
+    leading,
     narrowed,
     promising_fits,
     with_promising,
@@ -69,6 +70,18 @@ def test_scatters_are_learned_of_three_and_of_what_gains_something(monkeypatch: 
         order = list(found_of(a=9.0, b=8.5, c=8.2, d=8.1, e=8.0).values())
         told = finals_of(NO_DATA, fit("base", evidence), order, [], 1, (), True)
         assert [r.hypothesis.label for r in told.ranked if r.final] == list(expected)
+
+
+def test_the_best_linear_effects_are_finalists_behind_however_many_laws() -> None:
+    order = [(law(f"l{k}"), fit(f"l{k}", 90.0 - k)) for k in range(20)]
+    order += [
+        (hypothesis(name), fit(name, evidence)) for name, evidence in (("a", 40.0), ("b", 30.0), ("c", 20.0))
+    ]
+    found = [one.label for one, _ in leading(order, fit("base", 25.0))]
+    assert found == ["l0", "l1", "l2", "l3", "l4", "a", "b"]
+    found = [one.label for one, _ in leading(order, fit("base", 35.0))]
+    assert found == ["l0", "l1", "l2", "l3", "l4", "a"]  # only what gains something
+    assert len(leading(order[20:], fit("base", 25.0))) == 3  # and nothing twice
 
 
 def test_what_may_be_as_good_as_the_best_is_a_finalist_too(monkeypatch: pytest.MonkeyPatch) -> None:
