@@ -32,13 +32,17 @@ Step = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Spring:
-    """Elastic energy ½·stiffness·(row·x)²; N/m. `loss_factor` makes it stiffness·(1 + j·loss_factor)."""
+    """Elastic energy ½·stiffness·(row·x)²; N/m. `loss_factor` makes it stiffness·(1 + j·loss_factor).
+
+    Springs of one `part` deviate from the drawing together; those of one `piece` mostly, as directions of a bearing.
+    """
 
     name: str
     row: Row
     stiffness: float
     loss_factor: float = 0.0
     part: str = ""
+    piece: str = ""
 
 
 class Nonlinear:

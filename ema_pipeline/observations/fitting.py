@@ -27,11 +27,11 @@ from ema_pipeline.inference import (
 from ema_pipeline.inference.bounded import FURTHEST
 from ema_pipeline.inference.maximise import ANNEALING
 from ema_pipeline.observations.base import EffectProblem, Observations
-from ema_pipeline.observations.parts import FREE_STD, MASS_SCATTER, PART_SCATTER
+from ema_pipeline.observations.parts import DIRECTION_SCATTER, FREE_STD, MASS_SCATTER, PART_SCATTER
 from ema_pipeline.processes import spread
 from ema_pipeline.rigs.types import Rig
 
-PARTS = (PART_SCATTER, MASS_SCATTER)
+PARTS = (PART_SCATTER, MASS_SCATTER, DIRECTION_SCATTER)
 """Scatters of what the model is made of. A channel may be off by any factor, the model is none the worse for it."""
 _MOST_ESCAPES = 4
 """Barriers that a fit is led past, one after the other."""

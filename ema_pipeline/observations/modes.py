@@ -18,6 +18,8 @@ from ema_pipeline.observations.mode_problem import CALIBRATION, MIXING, ModeProb
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, UNEVEN_DAMPING
 from ema_pipeline.observations.parts import (
     DAMPING_SCATTER,
+    DIRECTION_SCATTER,
+    DIRECTION_STD,
     JOINT_DAMPING,
     MASS_SCATTER,
     MASS_STD,
@@ -25,6 +27,7 @@ from ema_pipeline.observations.parts import (
     STIFFNESS_STD,
     Dependence,
     dependence,
+    has_pieces,
 )
 from ema_pipeline.observations.rig_model import RigModel
 from ema_pipeline.observations.sensing import Sensing
@@ -49,7 +52,8 @@ def scatters_of(rig: Rig) -> dict[str, Scatter]:
         Scatter(SHAPE_NOISE, "stated uncertainty of shapes", 1.0, 0.5, least=0.1),
         Scatter(MIXING, "shapes of close modes along each other", 0.01, 1.0, 0.03, 5.0),
     )
-    return {s.name: s for s in known}
+    pieces = (Scatter(DIRECTION_SCATTER, "stiffness of a bearing's directions", DIRECTION_STD, 0.7, 0.04),)
+    return {s.name: s for s in (*known[:1], *(pieces if has_pieces(rig) else ()), *known[1:])}
 
 
 _BESIDE_JOINTS = {

@@ -23,10 +23,14 @@ DAMPING_SCATTER = "damping_scatter"
 JOINT_DAMPING = "joint_damping"
 PART_SCATTER = "part_scatter"
 MASS_SCATTER = "mass_scatter"
+DIRECTION_SCATTER = "direction_scatter"
 STIFFNESS_STD = 0.02
 """1 σ of stiffnesses from part to part where a rig states none, relative; their scatter is learned in its units."""
 MASS_STD = 0.005
 DAMPER_STD = 0.3
+DIRECTION_STD = 0.01
+"""The same of the directions of one piece of hardware about what it deviates itself: a rolling bearing that is softer
+than others is so in all directions. Learned apart: that directions agree does not tell that pieces do."""
 
 FREE_STD = (0.5, 2.5)
 """Least and largest prior 1 σ of the logarithm of a free parameter."""
@@ -118,13 +122,13 @@ def dependence(rig: Rig) -> Dependence:
     parts = _parts(rig, nominal, exponents)
     families = tuple(exponents)
     names = (*families, *(f"{key[1]} ({key[0].__name__.lower()})" for key in parts))
-    joints = _joints(nominal)
+    joints, pieces = _joints(nominal), _pieces(nominal)
     unknowns = joined(
         Unknowns.plain(
             families, [prior_std(rig.parameters[f]) for f in families], "", *_bounds(rig, families)
         ),
         *(
-            Unknowns.plain((name,), std, MASS_SCATTER if key[0] is Mass else PART_SCATTER)
+            Unknowns.plain((name,), std, DIRECTION_SCATTER if key in pieces else _kind(key))
             for name, (key, std) in zip(names[len(families) :], parts.items(), strict=True)
         ),
     )
@@ -135,6 +139,15 @@ def dependence(rig: Rig) -> Dependence:
         tuple(geometric),
         np.array([len(families) + i for i, key in enumerate(parts) if key in joints], np.int64),
     )
+
+
+def _kind(key: PartKey) -> str:
+    return MASS_SCATTER if key[0] is Mass else PART_SCATTER
+
+
+def has_pieces(rig: Rig) -> bool:
+    """True where some springs are directions of one piece of hardware."""
+    return bool(_pieces({c: rig.assembly(c) for c in rig.configurations}))
 
 
 def _joints(nominal: Mapping[str, Assembly]) -> set[PartKey]:
@@ -206,6 +219,7 @@ def _parts(
 ) -> dict[PartKey, float]:
     """Every part with the 1 σ of its deviation, in units of its kind's scatter; identical parts have none."""
     parts: dict[PartKey, float] = {}
+    pieces = _pieces(nominal)
     for configuration, assembly in nominal.items():
         for element in assembly.elements:
             key = part_key(element)
@@ -219,8 +233,17 @@ def _parts(
             default = {Mass: MASS_STD, Spring: STIFFNESS_STD}.get(key[0], DAMPER_STD)
             scatter = stated[0] if stated and stated[0] is not None else default
             if scatter > 0:
-                parts[key] = scatter / (MASS_STD if key[0] is Mass else STIFFNESS_STD)
+                std = scatter / (MASS_STD if key[0] is Mass else STIFFNESS_STD)
+                parts[key] = std
+                if key in pieces:
+                    parts[pieces[key]] = std
     return parts
+
+
+def _pieces(nominal: Mapping[str, Assembly]) -> dict[PartKey, PartKey]:
+    """Key of the piece that a part belongs to, where it belongs to one."""
+    springs = (e for assembly in nominal.values() for e in assembly.elements if isinstance(e, Spring))
+    return {part_key(e): (Spring, e.piece) for e in springs if e.piece}
 
 
 def _rows(
@@ -231,6 +254,7 @@ def _rows(
     count: int,
 ) -> dict[str, dict[PartKey, NDArray[np.float64]]]:
     at = {key: len(families) + i for i, key in enumerate(parts)}
+    pieces = _pieces(nominal)
     rows: dict[str, dict[PartKey, NDArray[np.float64]]] = {}
     for configuration, assembly in nominal.items():
         rows[configuration] = {}
@@ -238,8 +262,7 @@ def _rows(
             row = np.zeros(count)
             for i, name in enumerate(families):
                 row[i] = exponents[name][configuration].get(key, 0.0)
-            if key in at:
-                row[at[key]] = 1.0
+            row[[at[k] for k in (key, pieces.get(key)) if k in at]] = 1.0
             if np.any(row):
                 rows[configuration][key] = row
     return rows

@@ -179,7 +179,9 @@ def _build(planets: int, configuration: str, values: Mapping[str, float]) -> Ass
             row = {f"{body}.{axis}": 1.0}
             part = f"{body} inertia" if axis == "u" else f"{body} mass"
             elements.append(Mass(f"{body} mass {axis}", row, mass, part))
-            elements.append(Spring(f"{body} bearing {axis}", row, k))
+            elements.append(
+                Spring(f"{body} bearing {axis}", row, k, piece="" if axis == "u" else f"{body} bearing")
+            )
             if c:
                 elements.append(Damper(f"{body} bearing {axis} damper", row, c))
 
@@ -193,7 +195,8 @@ def _build(planets: int, configuration: str, values: Mapping[str, float]) -> Ass
         for axis, quantity in (("zeta", "mass"), ("eta", "mass"), ("u", "inertia")):
             elements.append(Mass(f"{p} mass {axis}", {f"{p}.{axis}": 1.0}, own(quantity), f"{p} {quantity}"))
         for axis, stretch in planet_bearing_rows(n, psi).items():
-            elements.append(Spring(f"{p} bearing {axis}", stretch, own("bearing_stiffness")))
+            stiffness = own("bearing_stiffness")
+            elements.append(Spring(f"{p} bearing {axis}", stretch, stiffness, piece=f"{p} bearing"))
             if own("bearing_damping"):
                 elements.append(Damper(f"{p} bearing {axis} damper", stretch, own("bearing_damping")))
         for gear, mesh_row in (("sun", sun_mesh_row), ("ring", ring_mesh_row)):

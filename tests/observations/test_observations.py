@@ -28,8 +28,9 @@ from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, mod
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.mode_problem import MIXING, ModeProblem
 from ema_pipeline.observations.mode_rows import SHAPE, SHAPE_NOISE
-from ema_pipeline.observations.modes import ModeObservations
+from ema_pipeline.observations.modes import ModeObservations, scatters_of
 from ema_pipeline.observations.parts import (
+    DIRECTION_SCATTER,
     JOINT_DAMPING,
     MASS_SCATTER,
     MASS_STD,
@@ -328,17 +329,28 @@ def test_parts_scatter_by_the_default_and_by_what_is_stated() -> None:
     stated = {"carrier_mass": Parameter("carrier_mass", 1.0, "kg", 0.01, scatter=0.1),
               "sun_bearing_stiffness": Parameter("sun_bearing_stiffness", 1e6, "N/m", 0.1, scatter=0.0)}  # fmt: skip
     known = dependence(planetary(2, stated))
-    std = dict(
-        zip(
-            known.unknowns.names,
-            known.unknowns.prior_std({PART_SCATTER: 0.02, MASS_SCATTER: 0.005}),
-            strict=True,
-        )
-    )
+    scatters = {PART_SCATTER: 0.02, MASS_SCATTER: 0.005, DIRECTION_SCATTER: 0.01}
+    std = dict(zip(known.unknowns.names, known.unknowns.prior_std(scatters), strict=True))
     assert std["carrier mass (mass)"] == pytest.approx(0.1)
     assert std["sun mass (mass)"] == pytest.approx(MASS_STD)
     assert std["sun-planet1 mesh (spring)"] == pytest.approx(STIFFNESS_STD)
     assert not any(n.startswith("sun bearing") for n in known.unknowns.names)
+
+
+def test_directions_of_a_bearing_deviate_with_it_and_a_little_more() -> None:
+    known = dependence(planetary(2))
+    names, rows = known.unknowns.names, known.elements["no_ring"]
+    scatters = {PART_SCATTER: 0.02, MASS_SCATTER: 0.005, DIRECTION_SCATTER: 0.01}
+    std = dict(zip(names, known.unknowns.prior_std(scatters), strict=True))
+    for piece, directions in (("planet2 bearing", ("radial", "tangential")), ("sun bearing", ("x", "y"))):
+        assert std[f"{piece} (spring)"] == pytest.approx(0.02)
+        for direction in directions:
+            assert std[f"{piece} {direction} (spring)"] == pytest.approx(0.01)
+            row = dict(zip(names, rows[Spring, f"{piece} {direction}"], strict=True))
+            of = {n for n, x in row.items() if x and "(" in n}
+            assert of == {f"{piece} (spring)", f"{piece} {direction} (spring)"}
+    assert DIRECTION_SCATTER in scatters_of(planetary(2))
+    assert DIRECTION_SCATTER not in scatters_of(chain())  # learned where there are bearings only
 
 
 def test_a_pressure_angle_that_is_uncertain_is_no_factor_on_elements() -> None:
