@@ -22,7 +22,7 @@ def test_the_tutorial_runs_and_gives_the_numbers_that_it_prints() -> None:
     client.NotebookClient(run, timeout=900, resources=place).execute()
     numbers = [o["text"] for cell in run.cells for o in cell.get("outputs", ()) if o.output_type == "stream"]
     value, std = map(float, numbers[-1].partition(" of ")[0].split(" ± "))
-    assert abs(value - 0.35) < std < 0.02
+    assert abs(value - 0.35) < std < 0.025
     assert numbers[-1] == printed.cells[-2].outputs[-1]["text"]
     assert any("mesh stiffness loss at sun-planet1" in str(cell.get("outputs")) for cell in run.cells)
 
