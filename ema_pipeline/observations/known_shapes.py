@@ -72,7 +72,7 @@ class KnownShapes:
     members : tuple of ndarray of int, (g, c)
         Places, among `on`, of the modes of groups, by their number c.
     mixes : ndarray of int, (q,)
-        Places in `ModeData.mixes` of the modes among them whose shapes may hold some of others'.
+        Places in `ModeData.holds` of the modes among them whose shapes may hold some of others'.
     mixed : ndarray of int, (q,)
         These modes, among `on`.
     along : ndarray, (q, s)
@@ -124,8 +124,7 @@ class KnownShapes:
 
         place = np.full(len(data), -1)
         place[on] = np.arange(len(on))
-        pairs = np.array([(a, b) for a, b, _ in data.mixes], int).reshape(-1, 2)
-        mixes = np.flatnonzero(place[pairs[:, 0]] >= 0)
+        mixes = np.flatnonzero(place[data.holds[:, 0]] >= 0)
         return cls(
             on=on,
             seen=seen,
@@ -138,8 +137,8 @@ class KnownShapes:
             lagging=entries(np.flatnonzero(data.lagging[on]), data.lag_std[on], data.lag_unit[on]),
             members=in_groups(data.group[on]),
             mixes=mixes,
-            mixed=place[pairs[mixes, 0]],
-            along=data.known_shapes[pairs[mixes, 1]],
+            mixed=place[data.holds[mixes, 0]],
+            along=data.known_shapes[data.holds[mixes, 1]],
         )
 
 

@@ -52,6 +52,8 @@ _UNEVEN = 10.0
 """
 _OVERLAP = 6.0
 """Half-widths within which one mode's shape may hold some of another's."""
+_LEAST_TURN = 0.003
+"""Turn of a shape towards another's, 1 σ, that is looked at: what is less lies within the scatter of shapes."""
 _NEARLY_ONE, _MORE = 0.35, 15.0
 """Distance of two poles, in half-widths, within which identification hardly tells their shapes apart, and by how much
 more it mixes them there: in 14 simulated rigs 0.0009 (root mean square) at one half-width, and up to 0.0085 at 0.3."""
@@ -271,6 +273,29 @@ class ModeData:
                     share = np.hypot(more / np.hypot(1.0, apart), _UNEVEN * uneven)
                     pairs.append((int(a), int(b), float(share)))
         return tuple(pairs)
+
+    @cached_property
+    def turns(self) -> tuple[tuple[int, int, float], ...]:
+        """Modes whose true shape drift turns towards that of another: mode, other one, and 1 σ of how far.
+
+        Parts that drift apart from each other move the frequencies of two modes apart, by δ ln(ωᵣ/ωₛ), and turn their
+        shapes by about δ / ln(ωᵣ/ωₛ). What all frequencies may share is drift of all parts, which turns none.
+        """
+        shaped = np.flatnonzero(np.any(self.seen, axis=1) & ~self.whirling)
+        variance = self.log_frequency_std[shaped] ** 2
+        own = variance - np.min(variance, initial=np.inf)
+        moved = np.sqrt(own[:, None] + own)
+        apart = np.hypot(moved, self.log_frequency[shaped, None] - self.log_frequency[shaped])
+        share = np.divide(moved, apart, out=np.zeros_like(apart), where=apart > 0)
+        np.fill_diagonal(share, 0.0)
+        return tuple(
+            (int(shaped[a]), int(shaped[b]), float(share[a, b])) for a, b in np.argwhere(share > _LEAST_TURN)
+        )
+
+    @cached_property
+    def holds(self) -> NDArray[np.int64]:
+        """Pairs of modes, (q, 2): what the shape of one holds of that of the other; all of `mixes`, then of `turns`."""
+        return np.array([pair[:2] for pair in (*self.mixes, *self.turns)], np.int64).reshape(-1, 2)
 
     @cached_property
     def group(self) -> NDArray[np.int64]:

@@ -179,8 +179,14 @@ class ModeProblem(EffectProblem):
             Unknowns.plain(tuple(gains), list(gains.values()), CALIBRATION),
             Unknowns.plain(tuple(across), list(across.values())),
             *(
-                Unknowns.plain(self._mixing(d), [share for _, _, share in d.mixes], MIXING)
+                unknowns
                 for d in self.observations.data
+                for unknowns in (
+                    Unknowns.plain(
+                        self._holding(d)[: len(d.mixes)], [share for *_, share in d.mixes], MIXING
+                    ),
+                    Unknowns.plain(self._holding(d)[len(d.mixes) :], [std for *_, std in d.turns]),
+                )
             ),
         )
 
@@ -202,11 +208,15 @@ class ModeProblem(EffectProblem):
     def _anywhere(self, dof: Dof) -> bool:
         return any(self.observations.has(d.configuration, dof) for d in self.observations.data)
 
-    def _mixing(self, d: ModeData) -> tuple[str, ...]:
+    def _holding(self, d: ModeData) -> tuple[str, ...]:
         """Names of unknowns: what the shape of a mode holds of that of another. Numbers of modes differ among data."""
         hz, test = np.exp(d.log_frequency), self.observations.test
         where = f"{d.configuration}{' in ' + test if test else ''}"
-        return tuple(f"shape of {hz[a]:.7g} Hz along that of {hz[b]:.7g} Hz, {where}" for a, b, _ in d.mixes)
+        words = ["along"] * len(d.mixes) + ["turned towards"] * len(d.turns)
+        return tuple(
+            f"shape of {hz[a]:.7g} Hz {how} that of {hz[b]:.7g} Hz, {where}"
+            for (a, b), how in zip(d.holds, words, strict=True)
+        )
 
     def sensing(self, data: ModeData) -> Sensing:
         """What the sensors of one configuration's modes read."""
@@ -237,7 +247,7 @@ class ModeProblem(EffectProblem):
             transverse[-1, i] = self.unknowns.index.get(_aim(dof.point, where), -1)
             across[-1, i] = along[i]
         drift = self.unknowns.index.get(_drift(d.configuration, self.observations.test), -1)
-        mixing = np.array([self.unknowns.index.get(n, -1) for n in self._mixing(d)], np.int64)
+        mixing = np.array([self.unknowns.index.get(n, -1) for n in self._holding(d)], np.int64)
         return Sensing(along, across, gain, transverse, drift, mixing)
 
     def paired(

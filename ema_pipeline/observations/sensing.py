@@ -28,7 +28,7 @@ class Sensing:
     drift : int
         Position of the unknown by which all frequencies are off together; -1 where no frequencies are compared.
     mixing : ndarray of int, (k,)
-        Positions of the unknowns of `ModeData.mixes`.
+        Positions of the unknowns of `ModeData.holds`.
     """
 
     along: NDArray[np.float64]

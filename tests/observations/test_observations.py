@@ -223,6 +223,23 @@ def test_shapes_of_poles_that_nearly_coincide_may_hold_far_more_of_each_other() 
     assert share(0.25, 0.0099) > 3 * share(0.25, 0.005)
 
 
+def test_drift_of_single_parts_turns_shapes_towards_each_other_and_that_of_all_parts_does_not() -> None:
+    def turns(std: list[float], hz: list[float]) -> dict[tuple[int, int], float]:
+        f, shapes = np.array(hz), np.array([[1.0, 0, 0.5], [0, 1.0, -0.5], [0.7, -0.7, 1.0]], complex)
+        measured = MeasuredModes(
+            "all", f, np.array(std) * f, np.full(3, 1e-3), np.full(3, 1e-5), shapes, np.full((3, 3), 1e-3),
+            tuple(Dof.parse(f"m{k}.x") for k in range(3)),
+        )  # fmt: skip
+        return {(a, b): share for a, b, share in prepare(measured).turns}
+
+    assert turns([1e-3] * 3, [100.0, 101.0, 150.0]) == {}
+    # 0.06 % besides the 0.08 % that all may share, between modes 1 % and 5 % apart: 0.06 and 0.012
+    found = turns([8e-4, 1e-3, 8e-4], [100.0, 100.0 * np.exp(0.01), 100.0 * np.exp(0.06)])
+    assert set(found) == {(0, 1), (1, 0), (1, 2), (2, 1)}
+    assert found[0, 1] == found[1, 0] == pytest.approx(0.06, rel=0.01)
+    assert found[1, 2] == pytest.approx(0.012, rel=0.01)
+
+
 def test_shapes_that_hold_some_of_each_other_are_told_from_a_model_that_is_wrong() -> None:
     """A share of 8 % that identification mixed in is found, and no part bends to it."""
     rig = planetary()
