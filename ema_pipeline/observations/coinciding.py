@@ -26,6 +26,8 @@ _FEWEST_SENSORS = 4
 _SEEN = 0.1
 """Share of the paired mode's squares from which the sensors see another one: in what was measured as one mode the two
 have shares as their residues, and one that hardly moves a sensor explains no wrong shape."""
+_EXPLAINED = 0.5
+"""Share of a measured shape's squares that two modes must explain together to have been measured as this one."""
 _ALONG = 1e-6
 """Share of a shape's weighted squares that it must have of its own beside the paired one."""
 
@@ -50,6 +52,26 @@ def hidden_partners(
     return np.asarray(
         nearest_seen(solution.frequency_hz, width, to, sensors >= _FEWEST_SENSORS, strength, _SEEN), np.int64
     )
+
+
+def held_in(
+    shapes: Real | NDArray[np.complex128], read: Real, to: NDArray[np.int64], partners: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """`hidden_partners`, -1 where the measured shape is no mix of both modes, (k,).
+
+    Parameters
+    ----------
+    shapes : ndarray, (k, s)
+        The measured ones of the paired modes, 0 where not measured.
+    read : ndarray, (s, n)
+    to, partners : ndarray of int, (k,)
+    """
+    held = partners.copy()
+    for k in np.flatnonzero(partners >= 0):
+        both = np.linalg.qr(np.where(shapes[k, :, None] != 0, read[:, [to[k], partners[k]]], 0.0))[0]
+        if np.linalg.norm(shapes[k] @ both) ** 2 < _EXPLAINED * np.linalg.norm(shapes[k]) ** 2:
+            held[k] = -1
+    return held
 
 
 def directions(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
 from ema_pipeline.mechanics.terms import Matrices
 from ema_pipeline.observations.close_modes import Groups, Mixed, Slopes
-from ema_pipeline.observations.coinciding import directions, hidden_partners
+from ema_pipeline.observations.coinciding import directions, held_in, hidden_partners
 from ema_pipeline.observations.comparison_kernel import scaled_rows, turning_rows
 from ema_pipeline.observations.known_shapes import KnownShapes, ShapeEntries, in_groups
 from ema_pipeline.observations.mode_data import ModeData
@@ -205,7 +205,9 @@ class Comparison:
         """Modes with a partner, these, and `hidden_partners`."""
         on = np.flatnonzero(match >= 0)
         to, sensors = match[on], self.data.sensors_for_another[on]
-        return on, to, hidden_partners(solution, to, sensors, self.readings.turned(solution))
+        read = self.readings.turned(solution)
+        hidden = hidden_partners(solution, to, sensors, read)
+        return on, to, held_in(self.data.compared_shapes[on], read, to, hidden)
 
     def _pairs(self, solution: EigenSolution, matching: object) -> _Pairs:
         """Kept, since derivatives are mostly wanted where a trial step was found to lead."""

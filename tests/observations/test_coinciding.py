@@ -13,7 +13,7 @@ import pytest
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
 from ema_pipeline.inference import Residuals, tails
-from ema_pipeline.observations.coinciding import directions, hidden_partners
+from ema_pipeline.observations.coinciding import directions, held_in, hidden_partners
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.mode_rows import Compared, Rows, whitened
 from ema_pipeline.observations.modes import ModeObservations
@@ -51,6 +51,20 @@ def test_a_mode_that_hardly_moves_a_sensor_hides_in_no_other() -> None:
     assert hidden_partners(solution([100.0, 99.9, 99.5]), to, sensors, read).tolist() == [2]
     read[:, 1] = 0.32
     assert hidden_partners(solution([100.0, 99.9, 99.5]), to, sensors, read).tolist() == [1]
+
+
+def test_a_shape_that_two_modes_do_not_explain_is_no_mix_of_them() -> None:
+    """An absorber turns a carrier at the frequency where two modes of a support move it along x and y."""
+    random = np.random.default_rng(1)
+    read = random.standard_normal((6, 3))
+    mix, other = read[:, 0] - 2 * read[:, 1], random.standard_normal(6)
+    other -= read[:, :2] @ np.linalg.lstsq(read[:, :2], other, rcond=None)[0]
+    other *= np.linalg.norm(mix) / np.linalg.norm(other)
+    to, partners = np.array([0, 0, 0, 2]), np.array([1, 1, 1, -1])
+    shapes = np.stack([mix, mix + 0.9 * other, mix + 1.1 * other, other])
+    assert held_in(shapes, read, to, partners).tolist() == [1, 1, -1, -1]
+    shapes[0, 3], shapes[2, 1:] = 0, 0  # entries that were not measured say nothing
+    assert held_in(shapes, read, to, partners).tolist() == [1, 1, 1, -1]
 
 
 def test_what_a_hidden_partner_adds_is_across_the_paired_shape_and_of_weighted_length_one() -> None:
