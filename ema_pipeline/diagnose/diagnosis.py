@@ -15,7 +15,6 @@ from ema_pipeline.diagnose.claims import Judged
 from ema_pipeline.diagnose.detection_limits import detection_limits
 from ema_pipeline.diagnose.explained import explanation
 from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
-from ema_pipeline.diagnose.in_full import in_full
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import averaged_size, in_said_names, sizes_of
 from ema_pipeline.diagnose.next_test import next_measurement
@@ -39,6 +38,7 @@ from ema_pipeline.diagnose.visible import nothing_visible
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Model
+from ema_pipeline.observations.in_full import fit_in_full
 from ema_pipeline.processes import aside
 from ema_pipeline.rigs.types import Rig
 
@@ -98,7 +98,8 @@ def diagnose(
         hypotheses = list_hypotheses(rig, library, known.labels, linear)
     first, faint = _selected(observations, known, hypotheses, settings, progress)
     # what else there may be is told to first order, as it was looked for
-    found = in_full(first, settings.processes)
+    observations, final = fit_in_full(first.observations, first.final, settings.processes)
+    found = replace(first, final=final, observations=observations)
     reached = explanation(found.observations, found.final, settings)
     explained = reached.explained
     verdict = verdict_of(found, settings, explained)

@@ -121,10 +121,10 @@ def _measured(run: Run) -> Ladder:
     EmaError
         For an effect that shows in hits at several levels only, where there are none.
     """
-    from ema_pipeline.diagnose.in_full import fit_in_full
     from ema_pipeline.diagnose.rungs import fits_of, ladder_of
     from ema_pipeline.fit.parameters import begun_at
     from ema_pipeline.observations.fitting import model_with
+    from ema_pipeline.observations.in_full import fit_in_full
     from ema_pipeline.run.models import (
         amplitude_observations,
         diagnosed_scatters,

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
 from simulate_amplitude import RIG, observed, simulated_hits
 
-from ema_pipeline.diagnose import in_full
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.mechanics.laws import DryFriction
+from ema_pipeline.observations import in_full
 from ema_pipeline.observations.amplitude import AmplitudeObservations
 from ema_pipeline.observations.fitting import (
     Fit,
@@ -145,22 +144,13 @@ def test_larger_motions_are_as_smaller_forces_and_rates() -> None:
     np.testing.assert_allclose(full.lattice._place(problem, x, problem.lattice_groups[0])[1], at)
 
 
-@dataclass(frozen=True)
-class Chosen:
-    """Stands for a selection."""
-
-    final: Any
-    observations: Any
-
-
 def test_a_calculation_in_full_that_explains_the_data_far_worse_is_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     observations, fit = linearised(0.1)
-    found: Any = Chosen(fit, observations)
-    better = in_full.in_full(found)
-    assert better.observations is not observations
-    assert better.final.log_evidence > fit.log_evidence
+    data, better = in_full.fit_in_full(observations, fit)
+    assert data is not observations
+    assert better.log_evidence > fit.log_evidence
 
     def behind(by: float) -> None:
         """Friction in full gains that much less than to first order, on rows that are known alike."""
@@ -168,9 +158,9 @@ def test_a_calculation_in_full_that_explains_the_data_far_worse_is_left(
             monkeypatch.setattr(in_full, name, lambda data, *asked: Fitted(-by if data.rubbing else 0.0))
 
     behind(9.9)
-    assert in_full.in_full(found).final.log_evidence == -9.9
+    assert in_full.fit_in_full(observations, fit)[1].log_evidence == -9.9
     behind(10.1)
-    assert in_full.in_full(found) is found
+    assert in_full.fit_in_full(observations, fit) == (observations, fit)
 
 
 @dataclass(frozen=True)
