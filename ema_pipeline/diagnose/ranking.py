@@ -120,8 +120,8 @@ def rank(
     near = settled is not None and unbent(observations, settled)
     pairing = _best_tried(tried, _PAIRING)
     among = _screened(hypotheses, promise, near)
-    chosen = [h for h in hypotheses if h in among or h.label in pairing]
     earlier = before or {}
+    chosen = [h for h in hypotheses if h in among or h.label in pairing or h.label in earlier]
 
     def job(hypothesis: Hypothesis) -> Posterior:
         if stuck:
@@ -138,7 +138,7 @@ def rank(
         # A few steps do not lead a mode of the model to a measured one that has no partner yet.
         leads = _best_tried({label: one for label, one in tried.items() if one.gain > PROMISING}, _ANNEALED)
         behind = short(chosen, processes)[_ANNEALED:]
-        known |= {h.label: fitted for h, fitted in behind if h.label not in leads}
+        known |= {h.label: fitted for h, fitted in behind if h.label not in leads and h.label not in earlier}
     decided = False
     left = [h for h in chosen if h.label not in known]
     for batch in _batches(left, promise if lost else {}, pairing):

@@ -98,7 +98,11 @@ def select(
     fitted: dict[str, Posterior] = {}
 
     def ask(
-        base: Fit, claimed: Sequence[Judged], rounds: Sequence[Round], among: Sequence[Hypothesis] = ()
+        base: Fit,
+        claimed: Sequence[Judged],
+        rounds: Sequence[Round],
+        among: Sequence[Hypothesis] = (),
+        before: Mapping[str, Posterior] = earlier.fitted,
     ) -> Round:
         left = [h for h in hypotheses if not _taken(observations, h, claimed)]
         labels = {h.label for h in among}
@@ -111,7 +115,7 @@ def select(
             lambda share, text: progress(done + share * part, text),
             settings.further_finalists,
             rounds[-1].ranking.unpaired if rounds else 0.0,
-            earlier.fitted,
+            before,
             [j.ranked.fit for j in claimed[-1:]],
         )
         fitted.update({r.hypothesis.label: r.fit.posterior for r in ranking.ranked})
@@ -133,8 +137,13 @@ def select(
             if both is not None:
                 found, ahead = _acquitted(found, leader, both, hypotheses, settings, len(claimed)), further
                 break
-        rounds.append(found)
         near = found.alike(settings)
+        if ahead and ahead.best and not near:
+            # what led carries no claim, and led to an effect that may carry one alone: asked from where it was found
+            led_to = {ahead.best.hypothesis.label: ahead.best.ranked.fit.posterior}
+            found, ahead = ask(found.ranking.base, claimed, rounds, before=led_to), None
+            near = found.alike(settings)
+        rounds.append(found)
         if not near or len(claimed) == settings.most_effects:
             final = found.ranking.base
             groups = alike_beside(observations, known, claimed, of_claims, final, settings)

@@ -382,6 +382,29 @@ def test_what_reduces_the_error_most_is_tried_where_no_second_effect_holds_besid
     assert tried == ["a@x", "b@x"]
 
 
+def test_what_was_found_beside_an_effect_that_carries_no_claim_is_asked_for_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The damper that led gained nothing, but beside it the fit of a mass did not stay at nothing as it had alone."""
+    damper, lost = as_judged("a@x", 1.4, PREDICTED_WORSE), as_judged("b@x", -9.0, "weak")
+    mass = as_judged("b@x", 50.0, "")
+    mass.ranked.fit.posterior = "where it was found"
+    steps = Steps(monkeypatch, [[damper, lost], [mass]])
+    judged_then = iter([(damper, lost), (mass,), (mass,), ()])
+    monkeypatch.setattr(
+        selection, "round_of", lambda o, ranking, *rest: Round(ranking, next(judged_then), {})
+    )
+    monkeypatch.setattr(selection, "_both", lambda *given: mass)
+    monkeypatch.setattr(selection, "_acquitted", lambda found, *rest: found)
+    monkeypatch.setattr(selection, "alike_beside", lambda *given: ())
+    found = steps.select([damper.hypothesis, mass.hypothesis], SETTINGS, [])
+    assert [j.hypothesis.label for j in found.claimed] == ["b@x"]
+    # both alone, the mass beside the damper, both alone from where the mass was found, what else there is
+    assert [asked for asked, _ in steps.asked] == [["a@x", "b@x"], ["b@x"], ["a@x", "b@x"], ["a@x"]]
+    assert [begun for begun, _ in steps.begun] == ["base", "a@x", "b@x"]
+    assert steps.before == [{}, {}, {"b@x": "where it was found"}, {}]
+
+
 @pytest.mark.parametrize(("error", "linearised"), [(1.5, False), (1.51, True)])
 def test_a_model_that_explains_the_data_or_is_linearised_calls_for_no_pairs(
     monkeypatch: pytest.MonkeyPatch, error: float, linearised: bool
