@@ -37,7 +37,8 @@ def check_answer_folder(folder: Path, own: str) -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise EmaError(f"{folder}: is no folder; name another with --out")
-    if (folder / DESCRIPTION_FILE).is_file() and not (folder / own).is_file():
+    raw = (folder / DESCRIPTION_FILE).is_file() or any(folder.glob(f"*/{DESCRIPTION_FILE}"))
+    if raw and not (folder / own).is_file():
         raise EmaError(
             f"{folder}: holds raw data, and results may replace files there; name another with --out"
         )

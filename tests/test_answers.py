@@ -27,3 +27,12 @@ def test_results_are_made_anew_where_theirs_were_deleted(tmp_path: Path) -> None
     for name in ("summary.json", "report.html", "modes.csv"):
         (tmp_path / name).touch()
     check_answer_folder(tmp_path, RESULTS_FILE)
+
+
+@pytest.mark.parametrize("below", [".", "with_ring"])
+def test_no_results_are_written_beside_raw_data(tmp_path: Path, below: str) -> None:
+    """Where they go into the folder of a campaign, a later run of a series leaves the whole campaign out."""
+    (tmp_path / below).mkdir(exist_ok=True)
+    (tmp_path / below / "test.toml").touch()
+    with pytest.raises(EmaError, match="holds raw data, and results may replace files there; name another"):
+        check_answer_folder(tmp_path, RESULTS_FILE)

@@ -10,6 +10,7 @@ import typer
 
 from ema_pipeline.commands.options import EffectFiles, Json, Out, Quiet
 from ema_pipeline.commands.screen import on_folder, progress, show, show_json
+from ema_pipeline.number_text import counted
 
 if TYPE_CHECKING:
     from ema_pipeline.choosing import Change
@@ -91,7 +92,8 @@ def _change(out: Path, change: Change, effect_files: list[str], quiet: bool, jso
     if table.rows:
         show(terminal.text_table(table, "Modes before and after"))
     if unmoved:
-        show(f"{unmoved} modes stayed within a twentieth of their uncertainty.")
+        whose = "its" if unmoved == 1 else "their"
+        show(f"{counted(unmoved, 'mode')} stayed within a twentieth of {whose} uncertainty.")
     show(error_words(before, after) or "Nothing has changed.")
     if results.diagnosis_is_old:
         again = on_folder("diagnose", out, results.effect_files)

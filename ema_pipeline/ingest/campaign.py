@@ -8,6 +8,7 @@ from pathlib import Path
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import read_bounded
 from ema_pipeline.ingest.description import DESCRIPTION_FILE, RIG_FILE, TestDescription, read_description
+from ema_pipeline.results_folder import RESULTS_FILE
 from ema_pipeline.toml_text import LARGEST_BYTES
 
 
@@ -52,12 +53,22 @@ def read_campaign(raw: Path) -> Campaign:
     """
     folders = description_folders(raw)
     if not folders:
-        raise EmaError(f"{raw}: no test.toml here or in its sub-folders; 'ema init {raw}' drafts one")
+        raise EmaError(_no_description(raw))
     tests = tuple(read_description(folder) for folder in folders)
     if len(tests) > 1:
         tests = tuple(_named(t) for t in tests)
     _check_campaign(raw, tests)
     return Campaign(root=raw, tests=tests, rig_file=_find_rig_file(raw, folders))
+
+
+def _no_description(raw: Path) -> str:
+    if (raw / RESULTS_FILE).is_file():
+        return f"{raw}: holds results, no raw data; name the raw folder, or run single stages on {raw}"
+    campaigns = sorted({p.parts[-3] for p in raw.glob(f"*/*/{DESCRIPTION_FILE}")})
+    if campaigns:
+        several = ", ".join(campaigns[:5])
+        return f"{raw}: holds several tests ({several}); name one, or all with 'ema series run {raw} --out S'"
+    return f"{raw}: no test.toml here or in its sub-folders; 'ema init {raw}' drafts one"
 
 
 def description_folders(raw: Path) -> list[Path]:

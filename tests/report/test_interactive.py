@@ -214,6 +214,25 @@ def test_axis_begins_with_the_modes_and_the_legend_has_what_the_chart_has(
     tab.close()
 
 
+def test_a_page_that_is_printed_has_figures_that_were_never_in_view_and_a_narrow_one_legends_that_fit(
+    browser, run: RunResults, tmp_path: Path
+) -> None:
+    page = tmp_path / "report.html"
+    page.write_text(report_html(run), encoding="utf-8")
+    tab = browser.new_page(viewport={"width": 1200, "height": 700})
+    tab.goto(page.as_uri())
+    for figure in ("frf", "stab", "errors"):
+        tab.wait_for_selector(f"[data-figure={figure}][data-state=shown]", timeout=30_000, state="attached")
+    of_legend = (
+        "Array.from(Bokeh.documents.find(d => d.get_model_by_name('frf.x'))._all_models.values())"
+        ".find(m => m.type === 'Legend').orientation"
+    )
+    assert tab.evaluate(of_legend) == "horizontal"
+    tab.set_viewport_size({"width": 400, "height": 700})
+    tab.wait_for_function(f"{of_legend} === 'vertical'", timeout=10_000)
+    tab.close()
+
+
 def test_a_mode_without_a_partner_in_one_model_of_two_stands_once_in_the_figure_of_errors(
     browser, run: RunResults, tmp_path: Path
 ) -> None:

@@ -84,6 +84,11 @@ var EmaPage = (function () {
       entries.forEach(function (e) { if (e.isIntersecting) { embed(e.target); } });
     }, { rootMargin: "300px" });
     places.forEach(function (p) { observer.observe(p); });
+    /* The page may be printed: what was not in view is drawn while nothing else is to be done. */
+    var rests = window.requestIdleCallback || function (what) { window.setTimeout(what, 200); };
+    function next() { var place = places.shift(); if (place) { embed(place); rests(next); } }
+    rests(next);
+    window.addEventListener("beforeprint", function () { places.splice(0).forEach(embed); });
   }
   function refill(names) { names.forEach(function (name) { if (documents[name]) { fill[name](); } }); }
 
@@ -295,7 +300,10 @@ var EmaPage = (function () {
     play(false);
     watch();
     if (window.matchMedia) {
-      window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", function () { Object.keys(documents).forEach(style); });
+      /* legends of a narrow page stand below each other */
+      ["(prefers-color-scheme: dark)", "(max-width: 699px)"].forEach(function (what) {
+        window.matchMedia(what).addEventListener("change", function () { Object.keys(documents).forEach(style); });
+      });
     }
     document.documentElement.dataset.ready = "yes";
   }
