@@ -178,16 +178,7 @@ class ModeProblem(EffectProblem):
             Unknowns.plain(drifts, DRIFT_STD),
             Unknowns.plain(tuple(gains), list(gains.values()), CALIBRATION),
             Unknowns.plain(tuple(across), list(across.values())),
-            *(
-                unknowns
-                for d in self.observations.data
-                for unknowns in (
-                    Unknowns.plain(
-                        self._holding(d)[: len(d.mixes)], [share for *_, share in d.mixes], MIXING
-                    ),
-                    Unknowns.plain(self._holding(d)[len(d.mixes) :], [std for *_, std in d.turns]),
-                )
-            ),
+            *(self._holding(d) for d in self.observations.data),
         )
 
     def _where(self, d: ModeData) -> str:
@@ -208,14 +199,17 @@ class ModeProblem(EffectProblem):
     def _anywhere(self, dof: Dof) -> bool:
         return any(self.observations.has(d.configuration, dof) for d in self.observations.data)
 
-    def _holding(self, d: ModeData) -> tuple[str, ...]:
-        """Names of unknowns: what the shape of a mode holds of that of another. Numbers of modes differ among data."""
+    def _holding(self, d: ModeData) -> Unknowns:
+        """What shapes hold of others, in the order of `ModeData.holds`. Numbers of modes differ among data."""
         hz, test = np.exp(d.log_frequency), self.observations.test
         where = f"{d.configuration}{' in ' + test if test else ''}"
-        words = ["along"] * len(d.mixes) + ["turned towards"] * len(d.turns)
-        return tuple(
-            f"shape of {hz[a]:.7g} Hz {how} that of {hz[b]:.7g} Hz, {where}"
-            for (a, b), how in zip(d.holds, words, strict=True)
+
+        def named(how: str, pairs: Sequence[tuple[int, int, float]]) -> list[str]:
+            return [f"shape of {hz[a]:.7g} Hz {how} that of {hz[b]:.7g} Hz, {where}" for a, b, _ in pairs]
+
+        return joined(
+            Unknowns.plain(named("along", d.mixes), [share for *_, share in d.mixes], MIXING),
+            Unknowns.plain(named("turned towards", d.turns), [std for *_, std in d.turns]),
         )
 
     def sensing(self, data: ModeData) -> Sensing:
@@ -247,7 +241,7 @@ class ModeProblem(EffectProblem):
             transverse[-1, i] = self.unknowns.index.get(_aim(dof.point, where), -1)
             across[-1, i] = along[i]
         drift = self.unknowns.index.get(_drift(d.configuration, self.observations.test), -1)
-        mixing = np.array([self.unknowns.index.get(n, -1) for n in self._holding(d)], np.int64)
+        mixing = np.array([self.unknowns.index.get(n, -1) for n in self._holding(d).names], np.int64)
         return Sensing(along, across, gain, transverse, drift, mixing)
 
     def paired(
