@@ -170,13 +170,16 @@ class RunResults:
 
     @property
     def provisional(self) -> bool:
-        """True where the model in use does not fit, so that its values hold only for a model that lacks nothing.
+        """True where the model in use lacks something, so that its values hold only for a model that lacks nothing.
 
-        A diagnosis of this model that finds it adequate decides: it judges by single hits, too.
+        A diagnosis of this model decides: it judges by single hits, too, and a fit may bend parts to the data.
         """
-        adequate = self.diagnosis is not None and self.diagnosis.verdict == "adequate"
-        fails = self.fit is not None and self.fit.error > self.fit.error_limit
-        return fails and (self.diagnosis_is_old or not adequate)
+        if self.fit is None:
+            return False
+        told = "" if self.diagnosis is None or self.diagnosis_is_old else self.diagnosis.verdict
+        return (
+            self.fit.error > self.fit.error_limit if told in ("", "not_enough_data") else told != "adequate"
+        )
 
     @property
     def current_rung(self) -> Rung | None:

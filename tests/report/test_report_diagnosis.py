@@ -745,9 +745,33 @@ def test_summary_holds_what_the_data_would_show(run: RunResults, tmp_path: Path)
 def test_values_of_a_model_that_fails_are_not_called_identified(run: RunResults) -> None:
     assert run.fit is not None
     (first, *_) = (p for p in run.fit.parameters.values() if p.identified)
-    good, failing = (replace(run, fit=replace(run.fit, error=error)) for error in (1.1, 6.3))
+    alone = replace(run, diagnosis=None)
+    good, failing = (replace(alone, fit=replace(run.fit, error=error)) for error in (1.1, 6.3))
     assert summary.identified_words(first, good.provisional) == "identified by the data"
     assert "identified" not in summary.identified_words(first, failing.provisional)
     states = {r.cells[5] for r in tables.parameters_table(run.fit, failing.provisional).rows}
     assert "identified" not in states
     assert "provisional" in states
+
+
+@pytest.mark.parametrize(
+    ("verdict", "old", "error", "provisional"),
+    [
+        ("effect", False, 1.1, True),  # parts were bent to the data
+        ("unknown_effect", False, 1.1, True),
+        ("adequate", False, 1.4, False),
+        ("not_enough_data", False, 1.1, False),
+        ("effect", True, 1.1, False),  # of another model
+        ("adequate", True, 1.4, True),
+    ],
+)
+def test_values_are_provisional_where_the_diagnosis_of_this_model_finds_that_it_lacks_something(
+    run: RunResults, verdict: VerdictWord, old: bool, error: float, provisional: bool
+) -> None:
+    assert run.fit is not None
+    assert run.diagnosis is not None
+    told = replace(
+        run, fit=replace(run.fit, error=error), diagnosis=replace(run.diagnosis, verdict=verdict),
+        diagnosed_on=("mass@sun",) if old else run.added,
+    )  # fmt: skip
+    assert told.provisional is provisional
