@@ -92,9 +92,9 @@ def test_what_may_be_as_good_as_the_best_is_a_finalist_too(monkeypatch: pytest.M
     for base, expected in ((5.0, "abcdefg"), (12.6, "abcde"), (0.0, "abcdefg")):
         told = finals_of(NO_DATA, fit("base", base), order, [], 1, (), True)
         assert "".join(r.hypothesis.label for r in told.ranked if r.final) == expected
-    many = list(found_of(**{f"x{k:02}": 14.0 for k in range(15)}).values())
+    many = list(found_of(**{f"x{k:02}": 14.0 for k in range(20)}).values())
     told = finals_of(NO_DATA, fit("base", 5.0), many, [], 1, (), True)
-    assert sum(r.final for r in told.ranked) == 12
+    assert sum(r.final for r in told.ranked) == 16
 
 
 def test_beside_a_base_model_that_explains_the_data_nothing_is_led_past_its_barriers_again(
