@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bench import ema
 from chain_rig import RIG
 from simulate_levels import Case, hits_of
 
@@ -114,6 +115,47 @@ def test_an_excluded_hit_stays_out_until_it_is_taken_back(tested: Path, out: Pat
     change_choices(out, including(hits=[f"default/{hit.file}#1"]))
     assert frequencies(out) == frequencies(tested / "out")
     assert not results(out).choices
+
+
+def test_answers_as_json_are_printed_when_quiet_and_the_ladder_says_how_old_it_is(
+    out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, told, err = ema(capsys, "diagnose", out, "--quiet", "--json")
+    assert code == 0, err
+    sizes = json.loads(told)["ladder"][0]["parameters"]
+    units = {name: p["unit"] for name, p in sizes.items()}
+    assert units
+    assert set(units.values()) == {"N/m", "1"}
+    assert json.loads(ema(capsys, "ladder", out, "--json")[1])["ladder"][0]["parameters"] == sizes
+    code, told, _ = ema(capsys, "ladder", out)
+    assert told == "The model has no added effects. The diagnosis found nothing missing.\n"
+
+    hit = f"default/{results(out).configurations[0].hits[0].file}#1"
+    code, told, err = ema(capsys, "exclude", out, "--hit", hit, "--quiet", "--json")
+    assert code == 0, err
+    assert json.loads(told)["choices"]["excluded_hits"] == [hit]
+    assert "says what it may be missing" in ema(capsys, "ladder", out)[1]
+    code, told, err = ema(capsys, "include", out, "--hit", hit, "--quiet", "--json")
+    assert code == 0, err
+    assert json.loads(told)["choices"]["excluded_hits"] == []
+
+
+def test_a_ladder_that_is_older_than_a_choice_says_so(
+    out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = results(out)
+    assert found.diagnosis is not None
+    base = found.diagnosis.ladder.rungs[0]
+    proposed = replace(found.diagnosis.ladder, rungs=(base, replace(base, effects=("spring@m1",))))
+    diagnosed = replace(found, diagnosis=replace(found.diagnosis, verdict="effect", ladder=proposed))
+    older = replace(diagnosed, choices=Choices((HitChoice("default", "x.uff", 1),)))
+    for known, said in ((diagnosed, False), (older, True)):
+        monkeypatch.setattr("ema_pipeline.stages.results.load_results", lambda run, known=known: known)
+        code, told, _ = ema(capsys, "ladder", out)
+        assert code == 0
+        assert "What the diagnosis proposes" in told
+        again = f"The diagnosis is older than the last change; repeat it: ema diagnose {out}\n"
+        assert told.endswith(again) == said
 
 
 def test_the_last_good_hit_of_a_point_cannot_be_excluded(out: Path) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ema_pipeline.commands.options import EffectFiles, Json, Out, Quiet
-from ema_pipeline.commands.screen import on_folder, progress, show, show_json
+from ema_pipeline.commands.screen import progress, show, show_json, show_old_diagnosis
 from ema_pipeline.number_text import counted
 
 if TYPE_CHECKING:
@@ -78,8 +78,6 @@ def _change(out: Path, change: Change, effect_files: list[str], quiet: bool, jso
         run = change_choices(out, change, show_stage, effect_files)
     results = load_results(run)
     after = seen(results)
-    if quiet:
-        return
     if json:
         content = {
             "choices": choices_summary(results.choices),
@@ -88,6 +86,8 @@ def _change(out: Path, change: Change, effect_files: list[str], quiet: bool, jso
         }
         show_json(finite(content))
         return
+    if quiet:
+        return
     table, unmoved = moved_table(before, after), still(before, after)
     if table.rows:
         show(terminal.text_table(table, "Modes before and after"))
@@ -95,6 +95,4 @@ def _change(out: Path, change: Change, effect_files: list[str], quiet: bool, jso
         whose = "its" if unmoved == 1 else "their"
         show(f"{counted(unmoved, 'mode')} stayed within a twentieth of {whose} uncertainty.")
     show(error_words(before, after) or "Nothing has changed.")
-    if results.diagnosis_is_old:
-        again = on_folder("diagnose", out, results.effect_files)
-        show(f"The diagnosis is older than this change; repeat it: {again}")
+    show_old_diagnosis(results, out)

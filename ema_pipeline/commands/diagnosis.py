@@ -12,7 +12,14 @@ import typer
 
 from ema_pipeline.commands.interrupts import go_on_with
 from ema_pipeline.commands.options import EffectFiles, Json, Out, Overrides, Quiet
-from ema_pipeline.commands.screen import on_folder, program, progress, show, show_summary
+from ema_pipeline.commands.screen import (
+    on_folder,
+    program,
+    progress,
+    show,
+    show_old_diagnosis,
+    show_summary,
+)
 from ema_pipeline.errors import EmaError
 
 if TYPE_CHECKING:
@@ -47,10 +54,10 @@ def diagnose(
         supported = [x for x in found.ladder.rungs[-1].effects if x not in run.info.effects]
         if auto and supported:
             run = change_effects(out, adding(supported), (), show_stage, effect_file or [])
-    if quiet:
-        return
     if json:
         show_summary(load_results(run), "diagnosis", "ladder")
+        return
+    if quiet:
         return
     files, added = results.effect_files, run.info.effects
     show(terminal.diagnosis_screen(found, str(out), program(), suspicions(results), files, added))
@@ -114,11 +121,9 @@ def _change(
             _show_ladder(run)
         with progress(quiet) as show_stage:
             run_stages(run, AFTER_EFFECTS, show_stage)
-    if quiet:
-        return
     if json:
         _show_ladder(run, json)
-    else:
+    elif not quiet:
         results = load_results(run, synthesis=False)
         model, report = model_words(results.added), run.store.folder / "report.html"
         told = results.current_rung or results.fit  # as the ladder states it: the fit may bend parts further
@@ -148,6 +153,13 @@ def _show_ladder(run: Run, json: bool = False) -> None:
     ):
         show("The model has no added effects. What the diagnosis proposes:")
         show(terminal.ladder_screen(results.diagnosis.ladder))
+        show_old_diagnosis(results, folder)
+    elif (
+        results.diagnosis is not None
+        and results.diagnosis.verdict == "adequate"
+        and not results.diagnosis_is_old
+    ):
+        show("The model has no added effects. The diagnosis found nothing missing.")
     else:
         again = on_folder("diagnose", folder, results.effect_files)
         show(f"The model has no added effects. '{again}' says what it may be missing.")

@@ -158,9 +158,7 @@ def fit(
     if results.fit is not None:
         show(terminal.fit_table(results.fit, results.provisional))
     elif results.current_rung is not None:
-        stated = {} if run.model is None else run.model.parameters
-        units = {name: p.unit for name, p in stated.items()}
-        show(terminal.rung_table(results.current_rung, units))
+        show(terminal.rung_table(results.current_rung))
     else:
         again = on_folder("diagnose", out, results.effect_files)
         show(f"The model in use has not been fitted yet; '{again}' does that.")

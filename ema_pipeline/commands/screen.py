@@ -69,6 +69,13 @@ def show_summary(results: RunResults, *parts: str) -> None:
     show_json({part: content[part] for part in parts if part in content})
 
 
+def show_old_diagnosis(results: RunResults, out: Path) -> None:
+    """Say that the diagnosis knows nothing of the last change, where that is so, and how to repeat it."""
+    if results.diagnosis_is_old:
+        again = on_folder("diagnose", out, results.effect_files)
+        show(f"The diagnosis is older than the last change; repeat it: {again}")
+
+
 @contextmanager
 def progress(quiet: bool) -> Iterator[ShowStage | None]:
     """Progress on stderr: bars on a terminal, a line per finished stage elsewhere, nothing when quiet."""

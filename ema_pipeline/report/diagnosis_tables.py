@@ -90,13 +90,13 @@ def ladder_table(ladder: Ladder) -> Table:
     return Table(head, tuple(rows), frozenset({2, 3, 4, 5}))
 
 
-def rung_table(rung: Rung, units: Mapping[str, str]) -> Table:
-    """One row per fitted parameter of one model, those of effects last; `units` where the rung has none."""
+def rung_table(rung: Rung) -> Table:
+    """One row per fitted parameter of one model, those of effects last."""
     names = sorted(rung.parameters, key=lambda name: "@" in name)
     rows = []
     for name in names:
         size = rung.parameters[name]
-        value = format_value(size.value, size.std, size.unit or units.get(name, ""))
+        value = format_value(size.value, size.std, size.unit)
         rows.append(Row((parameter_words(name), value if size.determined else NOT_DETERMINED)))
     return Table(("parameter", "fitted (±1σ)"), tuple(rows), frozenset())
 

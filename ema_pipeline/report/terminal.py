@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from rich import box
 from rich.cells import cell_len
@@ -84,7 +84,7 @@ def modes_table(modal: ModalModel, title: str = "Modes") -> RenderableType:
     source = tables.modes_table(modal).picked((0, 1, 2, 5, 6, 7))
     source = _renamed(source, ("mode", "frequency, Hz", "damping, %", "MPC", "stable", "method"))
     remarks = [
-        _line(f"mode {i}: {'; '.join(m.flags)}") for i, m in enumerate(modal.modes, start=1) if m.flags
+        sentence(f"mode {i}: {'; '.join(m.flags)}") for i, m in enumerate(modal.modes, start=1) if m.flags
     ]
     return Group(text_table(source, title), *remarks)
 
@@ -92,38 +92,42 @@ def modes_table(modal: ModalModel, title: str = "Modes") -> RenderableType:
 def levels_tables(study: LevelStudy, modal: ModalModel, title: str = "") -> RenderableType:
     """What moves with the force of the hits: the answer, then frequency and damping of every mode by level."""
     parts: list[RenderableType] = [_heading(title)] if title else []
-    parts.append(_line(study.summary))
+    parts.append(sentence(study.summary))
     if study.modes:
         table = levels.frequency_table(study, modal)
         last = len(table.head) - 1
-        parts += [_line(""), text_table(table.picked(range(last)), "Natural frequency by force level")]
+        parts += [sentence(""), text_table(table.picked(range(last)), "Natural frequency by force level")]
         remarks: dict[str, list[str]] = {}
         for row in table.rows:
             remarks.setdefault(row.cells[last], []).append(row.cells[0])
         for remark, alike in remarks.items():
             if remark:
-                parts.append(_line(f"{'mode' if len(alike) == 1 else 'modes'} {', '.join(alike)}: {remark}"))
-        parts += [_line(""), text_table(levels.damping_table(study), "Damping ratio by force level")]
+                parts.append(
+                    sentence(f"{'mode' if len(alike) == 1 else 'modes'} {', '.join(alike)}: {remark}")
+                )
+        parts += [sentence(""), text_table(levels.damping_table(study), "Damping ratio by force level")]
         sizes = levels.size_table(study)
         if sizes is not None:
             parts += [
-                _line(""),
+                sentence(""),
                 text_table(sizes, "Size in the FRFs by force level, 1 where it is the same in all hits"),
             ]
-        parts.append(_line("p: probability of a trend as clear as this where nothing depends on the force;"))
         parts.append(
-            _line("–: not tested, or damping that changes by less than 1 %, or a size by less than 10 %.")
+            sentence("p: probability of a trend as clear as this where nothing depends on the force;")
+        )
+        parts.append(
+            sentence("–: not tested, or damping that changes by less than 1 %, or a size by less than 10 %.")
         )
     failed = [v for v in study.verdicts if not v.passes]
     if failed:
-        parts += [_line(""), _line("Other signs:"), *(_line(f"! {v.message}") for v in failed)]
+        parts += [sentence(""), sentence("Other signs:"), *(sentence(f"! {v.message}") for v in failed)]
     return Group(*parts)
 
 
 def hits_table(hits: Sequence[Hit], title: str = "Hits") -> RenderableType:
     """How many hits were used, and every rejected hit or channel with its reason."""
     used = sum(h.accepted for h in hits)
-    head = _line(f"{title}: {used} of {len(hits)} used")
+    head = sentence(f"{title}: {used} of {len(hits)} used")
     source = tables.rejected_hits_table(hits)
     if not source.rows:
         return head
@@ -138,7 +142,7 @@ def verdict_table(hits: Sequence[Hit], title: str = "Hits") -> RenderableType:
     )
     return Group(
         text_table(tables.hits_table(hits), f"{title}: hits"),
-        _line(legend),
+        sentence(legend),
         text_table(tables.checks_table(hits), f"{title}: checks"),
     )
 
@@ -149,25 +153,25 @@ def comparison_tables(compared: Comparison) -> RenderableType:
     every = tables.differences_table(compared)
     names = list(dict.fromkeys(m.configuration for m in compared.modes))
     parts: list[RenderableType] = [
-        _line(
+        sentence(
             f"Model against measurement: {plain(compared.error, 3)} σ root mean square, "
             f"ε {plain(compared.frequency_error, 3)}"
         ),
-        _line(_COMPARISON_WORDS),
-        _line(_EPSILON_WORDS),
+        sentence(_COMPARISON_WORDS),
+        sentence(_EPSILON_WORDS),
     ]
     for name in names:
         title = f"{name}: " if len(names) > 1 else ""
         own = tables.Table(every.head, tuple(r for r in every.rows if r.cells[0] == name), every.numeric)
         table = _renamed(own.picked((1, 2, 3, 4, 5, 8, 9, 10)), heads)
-        parts += [_line("")] if title else []
+        parts += [sentence("")] if title else []
         parts.append(text_table(table, f"{title}per mode, (measured − model)/σ"))
     if compared.alone:
-        parts += [_line(""), *(_line(f"! {text}") for text in _alone(compared))]
+        parts += [sentence(""), *(sentence(f"! {text}") for text in _alone(compared))]
     if compared.dofs:
-        parts += [_line(""), text_table(tables.worst_dofs_table(compared), "DOFs that differ most")]
+        parts += [sentence(""), text_table(tables.worst_dofs_table(compared), "DOFs that differ most")]
     if compared.bands:
-        parts += [_line(""), text_table(tables.worst_bands_table(compared), "FRF bands that differ most")]
+        parts += [sentence(""), text_table(tables.worst_bands_table(compared), "FRF bands that differ most")]
     return Group(*parts)
 
 
@@ -195,17 +199,19 @@ def fit_table(fit: FitResult, provisional: bool) -> RenderableType:
     source = _renamed(source, ("parameter", "fitted (±1σ)", "nominal (±1σ)", "shift", "data say"))
     return Group(
         text_table(source, "Parameters; shift: in tolerances"),
-        _line(f"error {plain(fit.error, 3)} over {fit.data_count} data, ε {plain(fit.frequency_error, 3)}"),
-        _line(_EPSILON_WORDS),
+        sentence(
+            f"error {plain(fit.error, 3)} over {fit.data_count} data, ε {plain(fit.frequency_error, 3)}"
+        ),
+        sentence(_EPSILON_WORDS),
     )
 
 
-def rung_table(rung: Rung, units: Mapping[str, str]) -> RenderableType:
-    """Fitted parameters of one model of a ladder; `units` of those that the ladder knows none of."""
+def rung_table(rung: Rung) -> RenderableType:
+    """Fitted parameters of one model of a ladder."""
     return Group(
         _heading(f"Parameters of {diagnosis.model_words(rung.effects)}"),
-        text_table(diagnosis_tables.rung_table(rung, units), ""),
-        _line(f"error {plain(rung.error, 3)}"),
+        text_table(diagnosis_tables.rung_table(rung), ""),
+        sentence(f"error {plain(rung.error, 3)}"),
     )
 
 
@@ -233,31 +239,34 @@ def diagnosis_screen(
     added : sequence of str
         Labels that are in the model.
     """
-    parts: list[RenderableType] = [_line(f"! {text}") for text in suspicions]
-    parts += [_heading(diagnosis.heading(found)), _line(found.summary)]
+    parts: list[RenderableType] = [sentence(f"! {text}") for text in suspicions]
+    parts += [_heading(diagnosis.heading(found)), sentence(found.summary)]
     if found.candidates:
         parts += [
-            _line(""),
+            sentence(""),
             text_table(diagnosis_tables.candidates_table(found), "What may be missing"),
         ]
-        parts.append(_line(f"{_ERROR_WORDS}; {_HELD_OUT_WORDS}"))
-        parts += [_line(text) for text in (diagnosis.sigma_words(found),) if text]
+        parts.append(sentence(f"{_ERROR_WORDS}; {_HELD_OUT_WORDS}"))
+        parts += [sentence(text) for text in (diagnosis.sigma_words(found),) if text]
     for text in diagnosis.reasons(found):
-        parts += [_line(""), _line(text)]
+        parts += [sentence(""), sentence(text)]
     if unexplained := diagnosis.unexplained_words(found.ladder):
-        parts += [_line(""), _line(unexplained)]
+        parts += [sentence(""), sentence(unexplained)]
     if found.indistinguishable:
-        parts += [_line(""), *(_line(f"! {text}") for text in diagnosis.group_words(found))]
+        parts += [sentence(""), *(sentence(f"! {text}") for text in diagnosis.group_words(found))]
     if found.localisation:
-        parts += [_line(""), text_table(diagnosis_tables.localisation_table(found), "Where the misfit sits")]
+        parts += [
+            sentence(""),
+            text_table(diagnosis_tables.localisation_table(found), "Where the misfit sits"),
+        ]
     if found.next_measurement:
-        parts += [_line(""), _line(f"Measure next: {found.next_measurement}")]
+        parts += [sentence(""), sentence(f"Measure next: {found.next_measurement}")]
     if shown := diagnosis.detection_words(found):
-        parts += [_line(""), _line(shown)]
+        parts += [sentence(""), sentence(shown)]
     if found.ladder.scatters:
-        parts += [_line(""), text_table(diagnosis_tables.scatter_table(found.ladder), "Scatter, 1 σ")]
+        parts += [sentence(""), text_table(diagnosis_tables.scatter_table(found.ladder), "Scatter, 1 σ")]
     if found.notes:
-        parts += [_line(""), _line("Remarks on the data:"), *(_line(f"! {n}") for n in found.notes)]
+        parts += [sentence(""), sentence("Remarks on the data:"), *(sentence(f"! {n}") for n in found.notes)]
     if not suspicions:
         commands = diagnosis.next_commands(found, out, added, effect_files)
         parts += _commands([typed(c, program) for c in commands])
@@ -272,11 +281,11 @@ def ladder_screen(ladder: Ladder) -> RenderableType:
         told.insert(0, "left: measured modes that the model does not explain")
     parts: list[RenderableType] = [
         text_table(_renamed(diagnosis_tables.ladder_table(ladder), heads), "Ladder of models"),
-        _line("; ".join([_ERROR_WORDS, _HELD_OUT_WORDS, *told])),
-        _line(diagnosis.noise_words(ladder)),
+        sentence("; ".join([_ERROR_WORDS, _HELD_OUT_WORDS, *told])),
+        sentence(diagnosis.noise_words(ladder)),
     ]
     if ladder.note:
-        parts.append(_line(f"No further effect is added: {ladder.note}."))
+        parts.append(sentence(f"No further effect is added: {ladder.note}."))
     return Group(*parts)
 
 
@@ -306,7 +315,7 @@ def _heading(text: str) -> Safe:
 
 def _commands(lines: Sequence[str]) -> list[RenderableType]:
     """Commands to copy, each on one line however long it is."""
-    return [_line(""), _line("Next:"), *(_whole(f"  {line}") for line in lines)] if lines else []
+    return [sentence(""), sentence("Next:"), *(_whole(f"  {line}") for line in lines)] if lines else []
 
 
 def _whole(text: str) -> Safe:
@@ -314,7 +323,8 @@ def _whole(text: str) -> Safe:
     return Safe(lambda clean, width: Text(clean(text), no_wrap=True, overflow="ignore"))
 
 
-def _line(text: str) -> Safe:
+def sentence(text: str) -> Safe:
+    """A sentence, broken at the console's width."""
     return Safe(lambda clean, width: Text(clean(text)))
 
 

@@ -10,7 +10,7 @@ from typing import TypeVar, cast
 from ema_pipeline.check_result import CheckResult
 from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.diagnose.hysteresis_loop import HysteresisLoop
-from ema_pipeline.diagnose.types import Diagnosis, Ladder
+from ema_pipeline.diagnose.types import Diagnosis, Ladder, Rung
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import Hit, Transducer
@@ -116,10 +116,13 @@ def _typed(file: str) -> str:
 
 
 def _diagnosis(run: Run) -> Diagnosis | None:
-    """The diagnosis, with advice that its kind of data can follow."""
+    """The diagnosis, with units, and with advice that its kind of data can follow."""
     found = run.store.find("diagnose", ALL, "diagnosis", Diagnosis)
+    if found is None:
+        return None
+    found = replace(found, ladder=_with_units(found.ladder, run))
     advice = kind_of(run.info).next_measurement
-    if found is None or not advice or found.verdict != "unknown_effect":
+    if not advice or found.verdict != "unknown_effect":
         return found
     return replace(found, next_measurement=advice)
 
@@ -128,7 +131,19 @@ def _own_ladder(run: Run) -> Ladder | None:
     """The ladder of added effects; that of the base model alone only while the diagnosis is of other data."""
     if not run.info.effects and not diagnosis_is_of_other_data(run):
         return None
-    return run.store.find("ladder", ALL, "ladder", Ladder)
+    found = run.store.find("ladder", ALL, "ladder", Ladder)
+    return None if found is None else _with_units(found, run)
+
+
+def _with_units(ladder: Ladder, run: Run) -> Ladder:
+    """The ladder with the units of the rig's parameters, which its data do not know."""
+    units = {} if run.model is None else {name: p.unit for name, p in run.model.parameters.items()}
+
+    def stated(rung: Rung) -> Rung:
+        sizes = {n: replace(s, unit=s.unit or units.get(n, "")) for n, s in rung.parameters.items()}
+        return replace(rung, parameters=sizes)
+
+    return replace(ladder, rungs=tuple(map(stated, ladder.rungs)))
 
 
 R = TypeVar("R", RecordError, HysteresisLoop)

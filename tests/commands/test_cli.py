@@ -218,7 +218,7 @@ def test_an_effect_is_added_under_a_changed_setting_and_removed_and_the_ladder_s
     told = re.search(r"\(error ([\d.]+)\)", " ".join(text.split()))
     assert told is not None
     assert float(told[1]) == pytest.approx(summary["ladder"][2]["error"], rel=0.01)
-    code, text, _ = ema(capsys, "remove", out, damper, "--json")
+    code, text, _ = ema(capsys, "remove", out, damper, "--quiet", "--json")
     assert code == 0
     assert [rung["effects"] for rung in json.loads(text)["ladder"]] == [[], [effect]]
     code, text, _ = ema(capsys, "remove", out, effect)
