@@ -24,10 +24,17 @@ def verdict_text(found: Changes) -> str:
     """The answer in one or two sentences."""
     if found.physics is None:
         return _of_modes(found)
-    if found.physics.claimed:
-        return f"Changed: {'; '.join(change_lines(found))}."
     diagnosis = found.physics.diagnosis
     error = diagnosis.ladder.rungs[0].error
+    if found.physics.claimed:
+        changed = f"Changed: {'; '.join(change_lines(found))}."
+        if diagnosis.verdict != "unknown_effect":
+            return changed
+        after = diagnosis.ladder.rungs[-1].error
+        return (
+            f"The rig's model does not explain both tests (error {error:.2f} → {after:.2f}); what it finds is "
+            f"provisional. {changed}"
+        )
     if diagnosis.verdict == "unknown_effect":
         return (
             f"The rig's model does not explain both tests with one rig (error {error:.2f}), and no effect of the "

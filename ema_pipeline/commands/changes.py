@@ -57,7 +57,7 @@ def changes(
     from ema_pipeline.changes.page import write_page
     from ema_pipeline.changes.tables import limits_text, notes, short_modes_table, verdict_text
     from ema_pipeline.changes.two_tests import changes_content, compare_runs, open_test, write_changes
-    from ema_pipeline.report.terminal import text_table
+    from ema_pipeline.report.terminal import sentence, text_table
 
     repeats, by_rig = _repeats(repeat or []), rig != NO_RIG
     rig = rig if by_rig else None
@@ -77,12 +77,12 @@ def changes(
     if json:
         show_json(changes_content(found))
     elif not quiet:
-        show(verdict_text(found))
+        show(sentence(verdict_text(found)))
         if found.physics is not None and found.physics.diagnosis.detection_limits and found.verdict == "same":
-            show(limits_text(found.physics.diagnosis))
+            show(sentence(limits_text(found.physics.diagnosis)))
         show(text_table(short_modes_table(found), "Modes: A and B"))
-        for line in notes(found):
-            show(line)
+        for note in notes(found):
+            show(sentence(note))
         show(f"Report: {page}; {written}")
 
 

@@ -20,6 +20,7 @@ from ema_pipeline.changes.two_tests import Changes
 from ema_pipeline.commands.screen import show
 from ema_pipeline.correlate.matching import match_modes
 from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.diagnose.types import EffectSize
 from ema_pipeline.dof import Dof
 from ema_pipeline.job import run_raw
 from ema_pipeline.loops.simulate import PRINTED, write_sine_tests
@@ -106,6 +107,7 @@ def test_an_unchanged_rig_is_the_same_with_limits(
     assert 0 < limits["mass@m2"] < 0.03
     assert "The same within what these tests can show" in said
     assert "These tests would show, nine times in ten: " in said
+    assert max(len(line) for line in said.splitlines() if not line.startswith("Report: ")) <= 80
     assert re.search(r"[ ;]mass from [\d.]+ g\b", " ".join(said.split()))
     assert "mass mass" not in " ".join(said.split())
 
@@ -236,6 +238,24 @@ def test_modes_that_changed_although_no_effect_explains_it_are_said_beside_the_a
     )
     assert shift == "default: frequencies changed by less than 0.005 %, not all by the same share."
     assert said([10.0, 20.0])[0].endswith("(probability that nothing changed: 99.0 %).")
+
+
+@pytest.mark.parametrize("explained", [True, False])
+def test_a_change_of_tests_that_the_model_does_not_explain_is_called_provisional(explained: bool) -> None:
+    claim = SimpleNamespace(
+        label="mass@m2", parameters={"mass": EffectSize(0.06, 0.004, "kg")}, equivalents=(), probability=0.97
+    )
+    diagnosis = SimpleNamespace(
+        verdict="effect" if explained else "unknown_effect",
+        ladder=SimpleNamespace(rungs=[SimpleNamespace(error=7.31), SimpleNamespace(error=4.126)]),
+    )
+    physics = SimpleNamespace(claimed=(claim,), reverse=False, diagnosis=diagnosis)
+    said = verdict_text(cast("Changes", SimpleNamespace(physics=physics)))
+    changed = "Changed: mass at m2, mass 60.0 ± 4.0 g (probability 97 %)."
+    provisional = (
+        "The rig's model does not explain both tests (error 7.31 → 4.13); what it finds is provisional. "
+    )
+    assert said == (changed if explained else provisional + changed)
 
 
 @pytest.mark.parametrize(
