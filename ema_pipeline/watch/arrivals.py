@@ -13,6 +13,8 @@ from ema_pipeline.ingest.description import DESCRIPTION_FILE
 
 SETTLED_S = 0.25
 """A file that has not changed for so long is taken for complete; one that grows later is looked at again."""
+EMPTY_S = 2.0
+"""A file that is empty for so long stays empty: many programs create a file first and fill it at the end."""
 _STEP_MS = 50
 _POLL_MS = 100
 _SCAN_S = 1.0
@@ -24,7 +26,7 @@ _OTHER = frozenset({".toml", ".tmp", ".part", ".crdownload", ".html", ".json", "
 
 @dataclass(frozen=True)
 class Arrival:
-    """A file that looks complete.
+    """A file that looks complete, or stays empty.
 
     Attributes
     ----------
@@ -95,7 +97,7 @@ def _settled(path: Path, known: dict[str, _State]) -> bool:
     if state is None or (state.size, state.changed_ns) != (found.st_size, found.st_mtime_ns):
         known[path.name] = _State(found.st_size, found.st_mtime_ns, now)
         return False
-    if state.told or not path.is_file() or not state.size or now - state.seen < SETTLED_S:
+    if state.told or not path.is_file() or now - state.seen < (SETTLED_S if state.size else EMPTY_S):
         return False
     state.told = True
     return True

@@ -1,4 +1,4 @@
-"""One record of a test in progress: its hits, and how they agree with those before on the same point."""
+"""One record of a test in progress: its hits, and how they agree with those before."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def judge_record(
     record = load_record(test, entry)
     hits = hits_of_test([record])
     accepted = [_in_memory(record, h) for h in hits if h.accepted]
-    copied = [_copied(h, before) for h in accepted]
+    copied = [_copied(h, [*before, *elsewhere]) for h in accepted]
     good = [h for h, file in zip(accepted, copied, strict=True) if not file]
     faults = [
         v.message for h in hits for v in h.verdicts if not v.passes and v.consequence != "warn" and v.message
@@ -108,9 +108,9 @@ def judge_record(
     return judged, good
 
 
-def _copied(hit: HitSamples, before: Sequence[HitSamples]) -> str:
+def _copied(hit: HitSamples, known: Sequence[HitSamples]) -> str:
     """File of the earlier hit that this one is a copy of; empty for none."""
-    return next((b.hit.file for b in before if np.array_equal(b.force, hit.force)), "")
+    return next((b.hit.file for b in known if np.array_equal(b.force, hit.force)), "")
 
 
 def _in_memory(record: Record, hit: Hit) -> HitSamples:

@@ -145,6 +145,36 @@ def test_a_copy_of_a_hit_is_no_hit(source: Path, tmp_path: Path) -> None:
     assert "all points are done" in take(second, "m1_x_3.csv").text
 
 
+def test_a_copy_of_a_hit_on_another_point_is_no_hit(source: Path, tmp_path: Path) -> None:
+    """The file of one point, saved once more under the name of another."""
+    folder = _channels(source, tmp_path / "live")
+    session = Session(folder, ("m1.x", "m3.x"), wanted=1)
+    first = min(source.glob("m1*.csv"))
+    said = []
+    for name in ("m1_x_1.csv", "m3_x_1.csv"):
+        shutil.copy(first, folder / name)
+        said.append(session.take(Arrival(folder / name, time.time())))
+    assert [t.good for t in said] == [True, False]
+    assert "holds the same force as m1_x_1.csv, bit for bit" in said[1].text
+    assert said[1].text.endswith("strike m3.x again")
+
+
+def test_a_file_that_stays_empty_is_told(source: Path, tmp_path: Path) -> None:
+    """Not at once: a file that is filled within two seconds is judged as any other."""
+    folder = _channels(source, tmp_path / "live")
+    file = min(source.glob("m1*.csv"))
+
+    def write() -> None:
+        (folder / "m3_x_1.csv").touch()
+        (folder / file.name).touch()
+        time.sleep(0.5)
+        shutil.copy(file, folder / file.name)
+
+    told = _watched(folder, write, 2)
+    assert [(t.file, t.good) for t in told] == [(file.name, True), ("m3_x_1.csv", False)]
+    assert told[1].text == "✗ m3_x_1.csv: is empty; copy or export it again"
+
+
 def test_a_blow_on_another_point_than_was_asked_for_is_told(source: Path, tmp_path: Path) -> None:
     folder = _channels(source, tmp_path / "live")
     session = Session(folder, ("m1.x", "m3.x"), wanted=3)
