@@ -29,6 +29,20 @@ def report_path(out: Path) -> Path:
     return path.resolve()
 
 
+def check_rig_file(run: Run, file: Path) -> None:
+    """Whether the model of a run can be saved as this rig file, before it is fitted.
+
+    Raises
+    ------
+    EmaError
+        If the model is not fitted to modes, or the file exists already.
+    """
+    if "fit" not in stages_of(run):
+        words = kind_of(run.info).words
+        raise EmaError(f"{file}: models of {words} are not saved; copy the values that 'ema fit' shows")
+    refuse_existing([file], "name another file")
+
+
 def save_rig(run: Run, file: Path) -> None:
     """Write the fitted model of a run as a rig file.
 
@@ -40,13 +54,8 @@ def save_rig(run: Run, file: Path) -> None:
     """
     from ema_pipeline.fit.saved_rig import saved_rig
 
-    if "fit" not in stages_of(run):
-        words = kind_of(run.info).words
-        raise EmaError(f"{file}: models of {words} are not saved; copy the values that 'ema fit' shows")
-
+    check_rig_file(run, file)
     fit = run.store.load("fit", ALL, "fit", FitResult)
-    if file.exists():
-        raise EmaError(f"{file}: exists already and is kept; name another file")
     heads = [f"Fitted by ema to {run.info.raw}; tolerances are the values' own uncertainties, 1 sigma."]
     if fit.error > fit.error_limit:
         heads.append(f"Provisional: the model does not explain the data (error {fit.error:.3g}).")

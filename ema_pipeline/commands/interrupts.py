@@ -7,6 +7,7 @@ import shlex
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from contextvars import ContextVar
 from types import FrameType
 
@@ -23,12 +24,18 @@ _KEEPING = frozenset(
 )
 """Verbs whose finished stages are kept, so that the same command goes on from there."""
 
+_ending: ContextVar[Callable[[], str]] = ContextVar("ending", default=str)
 _go_on: ContextVar[str] = ContextVar("go_on", default="")
 
 
 def go_on_with(command: str) -> None:
     """From here on an interrupted command is finished by `command` rather than by typing it once more."""
     _go_on.set(command)
+
+
+def end_by_ctrl_c(ending: Callable[[], str]) -> None:
+    """From here on Ctrl-C is how the command ends: `ending` gives what is said, nothing while work is under way."""
+    _ending.set(ending)
 
 
 def answer_ctrl_c(program: str) -> None:
@@ -45,7 +52,8 @@ def answer_ctrl_c(program: str) -> None:
         if os.getpid() != own:  # a worker, which its parent outlives by no more than this
             os._exit(INTERRUPTED)
         signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
-        line = f"{_fresh_line()}ema: interrupted; {printable(_how_to_go_on(program))}\n"
+        told = _ending.get()() or f"interrupted; {_how_to_go_on(program)}"
+        line = f"{_fresh_line()}ema: {printable(told)}\n"
         os.write(
             2, line.encode(errors="replace")
         )  # not through sys.stderr, which may be in the middle of a line

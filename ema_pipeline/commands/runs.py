@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ema_pipeline.commands.interrupts import go_on_with
+from ema_pipeline.commands.interrupts import end_by_ctrl_c, go_on_with
 from ema_pipeline.commands.options import EffectFiles, Json, Out, Overrides, Quiet, RigOption, Verbose
 from ema_pipeline.commands.screen import on_folder, program, progress, show, show_json
 
@@ -134,7 +134,7 @@ def fit(
     json: Json = False,
 ) -> None:
     """Fit the model's parameters to what was measured in OUT, and show them."""
-    from ema_pipeline.export import save_rig
+    from ema_pipeline.export import check_rig_file, save_rig
     from ema_pipeline.job import run_on
     from ema_pipeline.kinds import require_judge, stages_of
     from ema_pipeline.report import terminal
@@ -143,8 +143,10 @@ def fit(
 
     with progress(quiet) as show_stage:
         # loops and simulated records have no fit of their own: every model of a ladder is one
-        to_modes = "fit" in stages_of(existing_run(out, effect_file or []))
-        stage = "fit" if to_modes else "ladder"
+        known = existing_run(out, effect_file or [])
+        stage = "fit" if "fit" in stages_of(known) else "ladder"
+        if save is not None:
+            check_rig_file(known, save)
         run, _ = run_on(out, [stage], set_ or [], show_stage, effect_file or [])
     require_judge(run, "fit")
     if save is not None:
@@ -252,11 +254,14 @@ def view(
     from ema_pipeline.report.commands import naming
     from ema_pipeline.store import Store
     from ema_pipeline.view.server import serve
+    from ema_pipeline.view.session import Session
 
     Store.existing(out)
-    # what was changed on the page is kept
+    session = Session(out, effect_file or [])
+    # what was changed on the page is kept, but for a change under way
     go_on_with(shlex.join(["view", str(out), *naming(effect_file or [])]))
-    serve(out, effect_file or [], port, ready)
+    end_by_ctrl_c(lambda: "" if session.job else "stopped; all changes are kept")
+    serve(session, port, ready)
 
 
 def _is_raw(folder: Path) -> bool:
@@ -274,7 +279,7 @@ def export(
         typer.Option(
             "--to",
             metavar="FOLDER",
-            help="Folder to write, no file there is replaced; OUT/export if left out.",
+            help="Folder to write, where no file is replaced. If left out, OUT/export, which is written anew.",
         ),
     ] = None,
     effect_file: EffectFiles = None,

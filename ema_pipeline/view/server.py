@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator, Callable, Sequence
-from pathlib import Path
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 from starlette.applications import Starlette
@@ -27,16 +26,12 @@ _BEAT_S = 1.0
 _QUIET_S = 15.0
 
 
-def serve(
-    folder: Path, effect_files: Sequence[str] = (), port: int = 0, ready: Callable[[str], None] | None = None
-) -> None:
+def serve(session: Session, port: int = 0, ready: Callable[[str], None] | None = None) -> None:
     """Serve the live page of a results folder until Ctrl-C.
 
     Parameters
     ----------
-    folder : Path
-    effect_files : sequence of str
-        Files with the user's own effects.
+    session : Session
     port : int
         0 takes a free one.
     ready : callable or None
@@ -45,9 +40,8 @@ def serve(
     Raises
     ------
     EmaError
-        If the folder holds no results, or the port is taken.
+        If the port is taken.
     """
-    session = Session(folder, effect_files)
     serve_guarded(lambda started: application(session, started), port, ready)
 
 

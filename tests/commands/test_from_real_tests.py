@@ -39,9 +39,11 @@ def test_a_fit_is_saved_as_a_rig_with_its_intervals_as_tolerances(
     assert k2.tolerance == pytest.approx(fitted["std"] / fitted["value"], rel=1e-2)
     assert abs(k2.value - 4.4e5) < 3 * fitted["std"]
     assert rig.parameters["k1"].unit == "N/m"
-    code, _, err = ema(capsys, "fit", out, "--save", saved)
+    before = (out / "ema.h5").read_bytes()
+    code, _, err = ema(capsys, "fit", out, "--set", "fit.sweep_points=50", "--save", saved)
     assert code == 1
     assert "exists already" in err
+    assert (out / "ema.h5").read_bytes() == before  # nothing was fitted
 
 
 def test_two_identical_records_are_noticed(

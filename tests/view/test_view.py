@@ -324,6 +324,12 @@ def test_a_click_that_the_server_does_not_answer_is_told(browser, still: tuple[P
     context.close()
 
 
+def test_ctrl_c_is_the_end_of_a_page_and_no_interruption(page: Page) -> None:
+    assert page.stop() == 0
+    assert page.process.stderr is not None
+    assert page.process.stderr.read() == "ema: stopped; all changes are kept\n"
+
+
 def test_server_stopped_amid_a_refit_leaves_the_folder_as_it_was(page: Page, out: Path) -> None:
     before = (out / "ema.h5").read_bytes()
     own = {
