@@ -63,7 +63,8 @@ def parse(model: type[M], data: Any, where: str | Path) -> M:
         return model.model_validate(data)
     except ValidationError as error:
         first, meant = _first(error.errors())
-        path, of = _path(first["loc"]), _of_table(first["loc"], data)
+        path, (key, name) = _path(first["loc"]), _entry(first["loc"], data)
+        of = f" of '{name}'" if name else ""
         if first["type"] == "extra_forbidden":
             known = [meant] if meant else _fields_at(model, first["loc"][:-1])
             raise EmaError(
@@ -76,7 +77,8 @@ def parse(model: type[M], data: Any, where: str | Path) -> M:
         message = message.replace("valid tuple", "list in [ ]").replace("Tuple", "List")
         message = re.sub(r"a valid dictionary( or instance of \w+)?", "a table of keys and values", message)
         shown = _shown(first.get("input"))
-        raise EmaError(f"{where}: {path or 'file'} = {shown}: {message}") from None
+        entry = f' ({key} = "{name}")' if name and key != first["loc"][-1] else ""
+        raise EmaError(f"{where}: {path or 'file'} = {shown}: {message}{entry}") from None
 
 
 def _first(found: Sequence[Mapping[str, Any]]) -> tuple[Mapping[str, Any], str]:
@@ -91,17 +93,20 @@ def _first(found: Sequence[Mapping[str, Any]]) -> tuple[Mapping[str, Any], str]:
     return first, ""
 
 
-def _of_table(loc: tuple[int | str, ...], data: Any) -> str:
-    """Of tables in a list, which are counted from 0, the one in which the key is by its name; empty without."""
+def _entry(loc: tuple[int | str, ...], data: Any) -> tuple[str, str]:
+    """Of tables in a list, which are counted from 0, what names the one with the key: which of its keys, and the name.
+
+    Both are empty where nothing does.
+    """
     for step in loc[:-1]:
         try:
             data = data[step]
         except (KeyError, IndexError, TypeError):
-            return ""
+            return "", ""
         if isinstance(step, int) and isinstance(data, dict):
-            name = next((data[key] for key in ("name", "file", "at") if isinstance(data.get(key), str)), None)
-            return f" of '{name}'" if name else ""
-    return ""
+            names = ((key, data[key]) for key in ("name", "file", "at") if isinstance(data.get(key), str))
+            return next(names, ("", ""))
+    return "", ""
 
 
 def _path(loc: tuple[int | str, ...]) -> str:

@@ -104,6 +104,14 @@ WRONG = {
         DESCRIPTION.replace('dof = "tip.z"', 'dof = "tip.z"\ncalibration_std = 2'),
         "calibration_std = 2: give a share",
     ),
+    "value of a channel": (
+        DESCRIPTION.replace('dof = "tip.z"', 'dof = "tip.z"\ntransverse = 2'),
+        'channels.1.transverse = 2: give a share from 0 to below 1, e.g. 0.02 for 2 % (name = "tip")',
+    ),
+    "point of a record": (
+        DESCRIPTION.replace('impact = "tip.z"', 'impact = "tip"'),
+        '(file = "hit1.',
+    ),
     "transverse in percent": (
         DESCRIPTION.replace('dof = "tip.z"', 'dof = "tip.z"\ntransverse = 3'),
         "transverse = 3: give a share",
