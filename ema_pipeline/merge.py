@@ -17,7 +17,7 @@ from ema_pipeline.correlate.matching import match_modes
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
-from ema_pipeline.files import cannot_write, read_bounded
+from ema_pipeline.files import cannot_write, read_bounded, refuse_existing
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.parts import Recorded, check_recorded_alike, gain_ratios
 from ema_pipeline.frf.types import FrfSet
@@ -169,8 +169,7 @@ def merge(
         hammers or sensors that contradict each other. Nothing is written then. What the descriptions tell is checked
         before modes are identified.
     """
-    if out.exists():
-        raise EmaError(f"{out}: exists already; choose a new folder with --out, or remove it")
+    refuse_existing([out], "choose a new folder with --out, or remove it")
     described = _described(sources)
     with tempfile.TemporaryDirectory(prefix="ema-merge-") as scratch:
         parts = [_identified(d, Path(scratch) / d.name, show) for d in described]
@@ -207,6 +206,8 @@ def _described(sources: Sequence[Path]) -> list[_Described]:
         found.append(_Described(name, raw, campaign.tests[0], campaign.rig_file, run))
     first = found[0].test
     for k, part in enumerate(found):
+        if any(other.raw.resolve() == part.raw.resolve() for other in found[:k]):
+            raise EmaError(f"{part.raw}: is given twice; give each test once")
         if any(other.name == part.name for other in found[:k]):
             raise EmaError(
                 f"{part.raw}: another of the folders is called '{part.name}', too; rename one, parts go by that name"

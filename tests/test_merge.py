@@ -247,6 +247,7 @@ def test_what_descriptions_tell_is_refused_before_modes_are_identified(
         for name in ("gearbox", "isolator")
     ]
     _refused(capsys, out, "names rig 'isolator'", "one test has one rig", *named)
+    _refused(capsys, out, "hard: is given twice", "", hard, hard.parent / "soft" / ".." / "hard")
     out.mkdir()
     code, _, err = ema(capsys, "merge", hard, tips / "soft", "--out", out)
     assert code == 1

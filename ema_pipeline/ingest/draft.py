@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
-from ema_pipeline.files import replace_file
+from ema_pipeline.files import refuse_existing, replace_file
 from ema_pipeline.ingest.derived import derived_channels
 from ema_pipeline.ingest.description import DESCRIPTION_FILE, RIG_FILE
 from ema_pipeline.ingest.file_size_limits import ReadLimits
@@ -40,6 +40,7 @@ _REPEATED = {
     "measurement",
 }
 _PLACEHOLDER_DIRECTION = "z"
+_REMEDY = "rename it to draft anew"
 _ENGINEERING = ("force", "acceleration", "velocity", "displacement")
 
 
@@ -83,9 +84,7 @@ def write_drafts(raw: Path, limits: ReadLimits | None = None) -> list[Path]:
         raise EmaError(f"{raw}: no record files here or in its sub-folders; copy them here first")
     missing = [folder for folder in folders if not (folder / DESCRIPTION_FILE).exists()]
     if not missing:
-        raise EmaError(
-            f"{folders[0] / DESCRIPTION_FILE}: exists already and is kept; rename it to draft anew"
-        )
+        refuse_existing([folders[0] / DESCRIPTION_FILE], _REMEDY)
     drafts = {folder / DESCRIPTION_FILE: draft_description(folder, limits) for folder in missing}
     for path, text in drafts.items():
         replace_file(path, text)
@@ -104,8 +103,7 @@ def draft_description(raw: Path, limits: ReadLimits | None = None) -> str:
     EmaError
         Where `raw` has a description already, or no record file that can be read.
     """
-    if (raw / DESCRIPTION_FILE).exists():
-        raise EmaError(f"{raw / DESCRIPTION_FILE}: exists already and is kept; rename it to draft anew")
+    refuse_existing([raw / DESCRIPTION_FILE], _REMEDY)
     found, problems = _read_all(raw, limits)
     if not found:
         reason = f"; {problems[0]}" if problems else ""
