@@ -33,6 +33,15 @@ def prefixed(magnitude: float, unit: str) -> tuple[float, str]:
     return 10.0**-power, _PREFIXES[power] + unit
 
 
+def prefixed_as(value: float, std: float, unit: str) -> tuple[float, str]:
+    """Factor and unit with which `format_value` shows a value and its standard deviation.
+
+    >>> prefixed_as(202.6e3, 2.4e3, "N/m")
+    (0.001, 'kN/m')
+    """
+    return prefixed(max(abs(value), std if math.isfinite(std) else 0.0), unit)
+
+
 def format_value(value: float, std: float, unit: str = "") -> str:
     """Value and standard deviation, both rounded to two figures of the deviation.
 
@@ -48,7 +57,7 @@ def format_value(value: float, std: float, unit: str = "") -> str:
     if not math.isfinite(value):
         return "not determined"
     known = math.isfinite(std) and std > 0
-    scale, shown_unit = prefixed(max(abs(value), std if known else 0.0), unit)
+    scale, shown_unit = prefixed_as(value, std, unit)
     tail = f" {shown_unit}" if shown_unit not in ("", "1") else ""
     value *= scale
     if not known:

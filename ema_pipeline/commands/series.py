@@ -16,6 +16,7 @@ import typer
 from ema_pipeline.commands.interrupts import go_on_with
 from ema_pipeline.commands.options import EffectFiles, Json, Overrides, Quiet, RigOption
 from ema_pipeline.commands.screen import program, show, show_json
+from ema_pipeline.number_text import counted
 from ema_pipeline.plain_text import printable
 
 if TYPE_CHECKING:
@@ -95,7 +96,9 @@ def _show_run(done: SeriesRun, tests: DataFrame) -> None:
     from ema_pipeline.series.database import rows_of
     from ema_pipeline.series.screens import verdict_counts
 
-    show(f"{done.found} tests: {done.computed} run, {done.skipped} unchanged, {done.failed} without results.")
+    show(
+        f"{counted(done.found, 'test')}: {done.computed} run, {done.skipped} unchanged, {done.failed} without results."
+    )
     if done.computed:
         grown = "" if done.growth != done.growth else f", last tenth {done.growth:.2f} times the first tenth"
         show(
@@ -117,7 +120,7 @@ def _progress(quiet: bool) -> Iterator[Watch]:
 
     def words(done: int, total: int) -> str:
         left = (time.monotonic() - start) / done * (total - done)
-        return f"{done} of {total} tests, {failed} failed, {_duration(left)} left"
+        return f"{done} of {counted(total, 'test')}, {failed} failed, {_duration(left)} left"
 
     if quiet:
         yield lambda done, total, row: None
@@ -210,7 +213,8 @@ def limits(
     for text in notes:
         show(f"Note: {text}")
     show(
-        f"Limits of {len(found.modes)} modes and {len(found.parameters)} parameters from {found.lot} tests: "
+        f"Limits of {counted(len(found.modes), 'mode')} and {counted(len(found.parameters), 'parameter')} from "
+        f"{counted(found.lot, 'test')}: "
         f"{100 * content:g} % of good tests within all of them, with {100 * confidence:g} % confidence."
     )
     show(f"Wrote {path}; judge with: {program()} series judge {s} --limits {path}")

@@ -14,7 +14,7 @@ import pandas as pd
 
 from ema_pipeline.diagnose.sentences import label_text, probability_text
 from ema_pipeline.files import replace_file
-from ema_pipeline.number_text import format_value, plain
+from ema_pipeline.number_text import counted, format_value, plain
 from ema_pipeline.report.pages import page_templates
 from ema_pipeline.report.style import png
 from ema_pipeline.report.tables import Row, Table
@@ -75,7 +75,7 @@ def _content(database: SeriesDatabase, limits: Limits | None, reference: str | N
     outlying = {str(k): list(t) for k, t in compared.outliers.groupby("feature")["test"]}
     figures = feature_figures(features, order.tests, order.by, ranges, outlying)
     return {
-        "title": f"Series of {len(tests)} tests",
+        "title": f"Series of {counted(len(tests), 'test')}",
         "subtitle": f"{database.about('tree')}; modes have the numbers of {numbers}.",
         "summary": _summary(tests, effects, list(judged.values()), compared, trends),
         **_test_table(database.folder, tests, effects, judged),

@@ -9,7 +9,7 @@ import pandas as pd
 from rich import box
 from rich.table import Table
 
-from ema_pipeline.number_text import format_value, plain
+from ema_pipeline.number_text import format_value, plain, prefixed_as
 from ema_pipeline.observations.parts import DAMPING as MODAL_DAMPING
 from ema_pipeline.series.compare import Comparison
 from ema_pipeline.series.database import rows_of
@@ -58,12 +58,14 @@ def comparison_table(found: Comparison) -> Table:
     )  # fmt: skip
     for name, row in found.table.iterrows():
         scale, unit = shown_in(str(name), str(row["unit"]))
+        mean, std = scale * row["mean"], scale * row["std_between"]
+        factor = scale * prefixed_as(mean, std, unit)[0]  # a row has one unit, that of its mean
         table.add_row(
             str(name),
             str(int(row["tests"])),
-            format_value(scale * row["mean"], scale * row["std_between"], unit),
+            format_value(mean, std, unit),
             *(
-                plain(scale * row[column], figures)
+                plain(factor * row[column], figures)
                 for column, figures in (("std_of_one", 2), ("min", 6), ("max", 6))
             ),
         )

@@ -7,16 +7,19 @@ import sqlite3
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.stats
 from bench import ema, write_bench
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.series.acceptance_limits import Range, learn_limits, read_limits
+from ema_pipeline.series.compare import Comparison
 from ema_pipeline.series.database import SeriesDatabase
 from ema_pipeline.series.features import features_of_series, modes_of_tests
 from ema_pipeline.series.judge import judged_value
 from ema_pipeline.series.rows import COLUMNS, Row, TestRow, failed_row
+from ema_pipeline.series.screens import comparison_table
 from ema_pipeline.series.trend import order_of, trends_of
 from ema_pipeline.significance import holm, tolerance_factor
 
@@ -197,6 +200,19 @@ def test_compare_shows_outliers_only(tmp_path: Path, capsys: pytest.CaptureFixtu
     table = {r["feature"]: r for r in json.loads(said)["features"]}
     assert table["mode 2 frequency"]["tests"] == 21
     assert ema(capsys, "series", "compare", tmp_path / "S")[0] == 0
+
+
+def test_a_row_of_the_comparison_has_one_unit() -> None:
+    """Uncertainty, least and largest have the prefix of the mean; damping is in per cent."""
+    rows = {
+        "k1": ("N/m", 3, 202.6e3, 2.4e3, 1.8e3, 199.9e3, 204.5e3),
+        "mode 1 damping": ("1", 3, 0.01, 0.0002, 1e-4, 0.0098, 0.0102),
+    }
+    names = ["unit", "tests", "mean", "std_between", "std_of_one", "min", "max"]
+    found = Comparison(pd.DataFrame.from_dict(rows, orient="index", columns=names), pd.DataFrame())
+    columns = [list(column.cells) for column in comparison_table(found).columns]
+    assert [column[0] for column in columns] == ["k1", "3", "202.6 ± 2.4 kN/m", "1.8", "199.900", "204.500"]
+    assert [column[1] for column in columns[2:]] == ["1.000 ± 0.020 %", "0.010", "0.980000", "1.02000"]
 
 
 def test_trend_finds_a_step_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
