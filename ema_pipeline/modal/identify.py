@@ -266,7 +266,8 @@ def _mode(
     zeta = -pole.real / size
     across = np.array([-1.0 / size + pole.real**2 / size**3, pole.real * pole.imag / size**3])
     if np.isfinite(scale_std) and scale_std > 0.1:
-        flags.append(f"scale uncertain by {100 * scale_std:.0f} %: the driving point lies near a node")
+        how_well = f"uncertain by {100 * scale_std:.0f} %" if scale_std <= 1 else "not determined"
+        flags.append(f"scale {how_well}: the driving point lies near a node")
     if zeta <= 0:
         flags.append("damping not above zero after the window's share was taken off")
     return Mode(

@@ -35,7 +35,7 @@ from ema_pipeline.modal.assurance import mac
 from ema_pipeline.modal.band_end import seen_band
 from ema_pipeline.modal.data import FitData, arrange
 from ema_pipeline.modal.fit import Estimate
-from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.identify import _mode, identify
 from ema_pipeline.modal.noise import fit_law
 from ema_pipeline.modal.peaks import KnownPeaks
 from ema_pipeline.modal.polish import polish
@@ -600,3 +600,19 @@ def test_weak_candidates_may_not_merge_modes_that_were_found(after: list[complex
 
     assert sub_bands._holds(at(after), at([-3 + 100j, -6 + 110j])) is holds
     assert sub_bands._holds(at(after), at([]))
+
+
+@pytest.mark.parametrize(
+    ("scale_std", "said"),
+    [
+        (0.05, ()),
+        (0.25, ("scale uncertain by 25 %: the driving point lies near a node",)),
+        (55.64, ("scale not determined: the driving point lies near a node",)),
+    ],
+)
+def test_a_scale_that_is_uncertain_by_more_than_itself_is_not_determined(
+    scale_std: float, said: tuple[str, ...]
+) -> None:
+    shape = np.ones(2)
+    found = _mode(-1.0 + 100.0j, 1e-4 * np.eye(2), shape + 0j, shape, shape, "", 1.0, scale_std, [])
+    assert found.flags == said
