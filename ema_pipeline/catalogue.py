@@ -13,6 +13,8 @@ from ema_pipeline.rigs import model_modes
 from ema_pipeline.run.settings import PipelineSettings
 from ema_pipeline.simulate.settings import SimulationSettings
 
+_UNSET = "not set"
+
 
 def list_model_modes(rig: str, configuration: str | None) -> dict[str, list[dict[str, Any]]]:
     """The model's own modes for one configuration, or for all of them."""
@@ -84,11 +86,14 @@ def _values(field: FieldInfo) -> str:
         for key, sign in signs.items()
         if hasattr(m, key)
     ]
-    return " ".join([" | ".join(dict.fromkeys(_choices(field.annotation))), ", ".join(limits)]).strip()
+    choices = list(dict.fromkeys(_choices(field.annotation)))
+    unset = [_UNSET] if _UNSET in choices else []  # comes last: limits are those of the others
+    stated = " | ".join(choice for choice in choices if choice != _UNSET)
+    return " | ".join([f"{stated} {', '.join(limits)}".strip(), *unset])
 
 
 def _choices(annotation: Any) -> Iterator[str]:
-    words = {int: "whole number", float: "number", str: "text", bool: "true | false", type(None): "not set"}
+    words = {int: "whole number", float: "number", str: "text", bool: "true | false", type(None): _UNSET}
     if isinstance(annotation, str):
         yield annotation
     elif hasattr(annotation, "__metadata__"):

@@ -13,7 +13,9 @@ RigOption = Annotated[
     str | None, typer.Option("--rig", "-r", metavar="RIG", help="Name of a rig, or a rig file (.toml).")
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more; show where a bug happened.")]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Say which stages were computed, and where a bug happened.")
+]
 EffectFiles = Annotated[
     list[str] | None,
     typer.Option(

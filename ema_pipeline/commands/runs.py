@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -65,7 +65,7 @@ def run(
         if not computed:
             show("Nothing had changed: all results are those of the earlier run.")
         elif verbose:
-            show(f"Computed: {', '.join(computed)}")
+            show(_computed_words(computed))
 
 
 def _show_summary(done: Run) -> None:
@@ -117,9 +117,13 @@ def stage_command(name: str) -> Callable[..., None]:
         if json:
             show_json(_content(run))
         elif not quiet:
-            show(f"Computed: {', '.join(computed)}" if computed else "Nothing had changed.")
+            show(_computed_words(computed))
 
     return command
+
+
+def _computed_words(computed: Sequence[str]) -> str:
+    return f"Computed: {', '.join(computed)}" if computed else "Nothing had changed."
 
 
 def fit(
@@ -147,7 +151,7 @@ def fit(
         stage = "fit" if "fit" in stages_of(known) else "ladder"
         if save is not None:
             check_rig_file(known, save)
-        run, _ = run_on(out, [stage], set_ or [], show_stage, effect_file or [])
+        run, computed = run_on(out, [stage], set_ or [], show_stage, effect_file or [])
     require_judge(run, "fit")
     if save is not None:
         save_rig(run, save)
@@ -164,6 +168,8 @@ def fit(
     else:
         again = on_folder("diagnose", out, results.effect_files)
         show(f"The model in use has not been fitted yet; '{again}' does that.")
+    if verbose:
+        show(_computed_words(computed))
     if save is not None:
         show(f"Wrote {save}; use it with --rig {save}")
 

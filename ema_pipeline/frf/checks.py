@@ -137,7 +137,7 @@ def _scatter(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[CheckRe
         excess = (seen - _floor(variance, peaks)).clip(min=0.0)
         scatter = float(np.sqrt(n * np.sum(excess / seen) / np.sum(power / seen)))
         steady = scatter <= settings.repeatability
-        loose = f"single hits of {name} scatter by {scatter:.0%}: strike the same spot in the same direction"
+        loose = f"single hits of {name} scatter by {100 * scatter:.0f} %: strike the same spot in the same direction"
         most = settings.repeatability
         verdicts.append(
             judged("repeatability", scatter, most, steady, REPEATABILITY, "warn", loose, channel=name)
@@ -268,8 +268,8 @@ def _reciprocity(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Che
             passes = difference <= settings.reciprocity
             name = f"{frfs.outputs[o1]} and {frfs.outputs[o2]}"
             fault = (
-                f"FRFs between {name} differ by {difference:.0%} with the direction: hits off their direction or "
-                "place, frequencies that drift, or a nonlinearity"
+                f"FRFs between {name} differ by {100 * difference:.0f} % with the direction: hits off their direction "
+                "or place, frequencies that drift, or a nonlinearity"
             )
             limit = settings.reciprocity
             verdicts.append(

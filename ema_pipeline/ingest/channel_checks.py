@@ -86,9 +86,8 @@ def _dead_channel(
     only_hum = hum > HUM_ONLY
     passes = spans > 1.5 and not only_hum
     if only_hum:
-        fault = (
-            f"{name} carries mains hum only ({hum:.1%} of its power) and no response to the blow: open cable?"
-        )
+        share = f"{100 * hum:.1f} % of its power"
+        fault = f"{name} carries mains hum only ({share}) and no response to the blow: open cable?"
     elif spans == 0:
         fault = f"{name} is constant at {samples[0]:.3g}: sensor or cable dead"
     else:
@@ -111,9 +110,9 @@ def overload(
     share = largest / full_scale if np.isfinite(full_scale) else 0.0
     passes = share < settings.overload
     at = int(np.argmax(np.abs(samples)))
-    fault = f"overload on {name}: {share:.1%} of full scale {(at - peak) / rate:+.4g} s from the blow"
+    fault = f"overload on {name}: {100 * share:.1f} % of full scale {(at - peak) / rate:+.4g} s from the blow"
     if share > BEYOND_SCALE:
-        fault = f"{name} reaches {share:.0%} of its full scale, which no input can: correct it in test.toml"
+        fault = f"{name} reaches {100 * share:.0f} % of its full scale, which no input can: correct it in test.toml"
     return judged("overload", share, settings.overload, passes, OVERLOAD, consequence, fault, channel=name)
 
 
@@ -130,8 +129,8 @@ def flat_top(
     fault = f"{name} is clipped: its tops are flat; use a lower gain or hit softer"
     if far_below:
         fault = (
-            f"{name} is clipped at {used:.2%} of its full scale: its tops are flat; look for a saturated amplifier, or "
-            "correct the full scale in test.toml"
+            f"{name} is clipped at {100 * used:.2f} % of its full scale: its tops are flat; look for a saturated "
+            "amplifier, or correct the full scale in test.toml"
         )
         consequence = consequence if stands_at_top(samples) else "warn"
     return judged("clipping", share, FLAT_TOP_LIMIT, passes, OVERLOAD, consequence, fault, channel=name)
@@ -212,5 +211,5 @@ def _decay(
     silent = left < quiet * np.sqrt(3 / np.sqrt(2 * length)) * 1.5 or largest < 3 * quiet
     ratio = 0.0 if silent or largest == 0 else left / largest
     limit = settings.residual_response
-    fault = f"{name} still at {ratio:.1%} of its largest at the end: record longer"
+    fault = f"{name} still at {100 * ratio:.1f} % of its largest at the end: record longer"
     return judged("response decay", ratio, limit, ratio <= limit, DECAY, "warn", fault, channel=name)

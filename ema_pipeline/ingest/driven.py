@@ -19,7 +19,7 @@ from ema_pipeline.ingest.lost_samples import frozen_stretch
 from ema_pipeline.ingest.pulse import noise_of, step_of
 from ema_pipeline.ingest.records import ResponseChannel
 
-FIT, HELD_OUT = "fit", "held_out"
+HELD_OUT = "held_out"
 
 BURSTS = "burst_random"
 """Excitation whose `period_samples` are those of a burst and its rest: bursts differ, so that nothing repeats."""
@@ -335,8 +335,8 @@ def _check_period(force: NDArray[np.float64], period: int, where: str) -> None:
     share = float(np.sqrt(np.mean(change**2) / max(np.mean(about**2), 1e-300)))
     if share > SAME_PERIOD:
         raise EmaError(
-            f"{where}: period_samples = {period} does not fit: the force differs by {share:.0%} from one period to "
-            "the next; correct it, or remove it where the force does not repeat"
+            f"{where}: period_samples = {period} does not fit: the force differs by {100 * share:.0f} % from one "
+            "period to the next; correct it, or remove it where the force does not repeat"
         )
 
 

@@ -89,7 +89,7 @@ def _copy_told(hit: Hit, original: str) -> Hit:
     if not original:
         return hit
     fault = f"{hit.file} holds the same force record as {original}, bit for bit: one is a copy; take it out"
-    verdict = judged("copy", 1.0, 0.0, False, "", "warn", fault, unit="copies")
+    verdict = judged("copy", 1.0, 0.0, False, "", "warn", fault, unit="copy")
     return replace(hit, verdicts=(*hit.verdicts, verdict))
 
 
@@ -104,7 +104,7 @@ def _copied_channel(original: str, name: str) -> CheckResult:
         f"channels '{original}' and '{name}' hold the same samples: one is a copy; correct its name in test.toml or "
         "take the channel out"
     )
-    return judged("copy", 1.0, 0.0, False, "", "warn", fault, channel=name, unit="copies")
+    return judged("copy", 1.0, 0.0, False, "", "warn", fault, channel=name, unit="copy")
 
 
 def _without_false_clipping(
@@ -233,7 +233,7 @@ def _double_hit(force: NDArray[np.float64], pulse: Pulse, rate: float, settings:
     when = "after" if second.delay_s > 0 else "before"
     apart = abs(second.delay_s)
     span = f"{apart * 1e3:.1f} ms" if apart < 1 else f"{apart:.3g} s"
-    fault = f"second impact of {second.ratio:.0%}, {span} {when} the peak"
+    fault = f"second impact of {100 * second.ratio:.0f} %, {span} {when} the peak"
     if second.ratio > _NO_BLOW:
         fault = (
             "the force has no pulse where its peak should be: does the record begin or end within the blow?"

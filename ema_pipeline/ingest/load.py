@@ -157,8 +157,8 @@ def load_record(test: TestDescription, entry: RecordDescription, limits: ReadLim
     if swap is not None:
         raise EmaError(
             f"{test.path_of(entry)}: channels '{test.force.name}' and '{swap.channel}' look swapped: "
-            f"'{swap.channel}' has 90 % of its energy in {swap.response_share:.2%} of its samples and on one "
-            f"side of zero, as a hammer has, while '{test.force.name}' rings ({swap.force_share:.1%}); "
+            f"'{swap.channel}' has 90 % of its energy in {100 * swap.response_share:.2f} % of its samples and on one "
+            f"side of zero, as a hammer has, while '{test.force.name}' rings ({100 * swap.force_share:.1f} %); "
             "exchange their names in test.toml"
         )
     channels = []
@@ -253,7 +253,7 @@ def _sample_rate(test: TestDescription, raw: RawRecord, where: str) -> float:
     if stated is None and raw.rate_tolerance > COARSEST_RATE:
         raise EmaError(
             f"{where}: its time stamps are too coarse to tell the sample rate ({found:.4g} Hz to within "
-            f"{raw.rate_tolerance:.1%}); add sample_rate_hz to {test.file}"
+            f"{100 * raw.rate_tolerance:.1f} %); add sample_rate_hz to {test.file}"
         )
     if stated is None and found is not None and raw.seconds_assumed and found < SLOWEST_UNSTATED_HZ:
         raise EmaError(

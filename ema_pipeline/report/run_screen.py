@@ -136,7 +136,8 @@ def _verdict(results: RunResults) -> str:
     if not modes:
         return "No modes were found." if results.configurations else "Nothing has been analysed yet."
     low, high = min(m.frequency_hz for m in modes), max(m.frequency_hz for m in modes)
-    return f"{counted(len(modes), 'mode')} from {plain(low)} to {plain(high)} Hz; no model was named (--rig)."
+    span = f"at {plain(low)}" if len(modes) == 1 else f"from {plain(low)} to {plain(high)}"
+    return f"{counted(len(modes), 'mode')} {span} Hz; no model was named (--rig)."
 
 
 def _diagnosed(found: Diagnosis) -> str:

@@ -12,7 +12,7 @@ from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.modal.circle.compare import average_told
 from ema_pipeline.modal.types import ModalModel, Mode
-from ema_pipeline.number_text import below, format_percent, format_value, plain, prefixed, signed
+from ema_pipeline.number_text import below, format_percent, format_value, plain, prefixed_as, signed
 from ema_pipeline.report.diagnosis import parameter_words
 from ema_pipeline.report.name_text import words
 from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC
@@ -106,7 +106,7 @@ def parameters_table(fit: FitResult, provisional: bool) -> Table:
     """
     rows = []
     for p in fit.parameters.values():
-        scale, unit = prefixed(max(abs(p.value), p.std if math.isfinite(p.std) else 0.0), p.unit)
+        scale, unit = prefixed_as(p.value, p.std, p.unit)
         low, high = (plain(v * scale, 4) if math.isfinite(v) else "open" for v in (p.low, p.high))
         tail = f" {unit}" if unit not in ("", "1") else ""
         far = math.isfinite(p.shift_z) and abs(p.shift_z) > FAR_SIGMA
@@ -326,13 +326,19 @@ def checks_table(hits: Sequence[Hit]) -> Table:
         result += " (channels)" if failed and verdicts[0].consequence == "reject_channel" else ""
         cells = (
             words(check),
-            with_unit(verdicts[0].limit, verdicts[0].unit),
+            _direction(verdicts) + with_unit(verdicts[0].limit, verdicts[0].unit),
             with_unit(_worst(verdicts).value, verdicts[0].unit),
             result,
             verdicts[0].clause or "own limit",
         )
         rows.append(Row(cells, rejects))
     return Table(("check", "limit", "worst", "result", "clause"), tuple(rows))
+
+
+def _direction(verdicts: Sequence[CheckResult]) -> str:
+    """Whether a limit is the least or the most, as its verdicts tell; empty where it is neither, or both."""
+    at_least = {v.passes == (v.value > v.limit) for v in verdicts if v.value != v.limit}
+    return {(True,): "≥ ", (False,): "≤ "}.get(tuple(at_least), "")
 
 
 def failed_checks_table(verdicts: Sequence[CheckResult]) -> Table:

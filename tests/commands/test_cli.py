@@ -249,6 +249,13 @@ def test_a_diagnosis_of_a_model_is_dropped_with_an_effect_that_it_had(
     assert (code, "shaft torsion" in text) == (0, False)
 
 
+def test_verbose_says_what_a_fit_computed(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, text, _ = ema(capsys, "fit", results, "--verbose")
+    assert code == 0
+    assert text.endswith("\nNothing had changed.\n")
+    assert "Nothing had changed" not in ema(capsys, "fit", results)[1]
+
+
 def test_an_effect_that_does_not_exist_is_refused_and_changes_nothing(
     results: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -756,6 +763,7 @@ def test_every_setting_is_listed_with_its_default_its_values_and_why(
         "description": "",
     }
     assert listed["frf.reciprocity"]["values"] == "number > 0"
+    assert listed["frf.block_samples"]["values"] == "whole number ≥ 64 | not set"
     assert [name for name, s in listed.items() if not s["description"]] == []
     code, out, _ = ema(capsys, "settings", "correlate.pairing")
     assert code == 0
@@ -790,6 +798,8 @@ def test_check_fits_80_columns_with_units_and_clauses_and_fails_where_a_point_ha
     assert len([line for line in out.splitlines() if ".h5" in line and "FAIL" in line]) == 3
     assert re.search(r"m1\.x +\d+ N +\d+\.?\d* % +\d+ Hz", out)
     assert "2.5 %" in out
+    assert re.search(r"^ +force level +≥ \d+ × +\d+ × ", out, re.MULTILINE)
+    assert re.search(r"^ +response decay +≤ [\d.]+ % ", out, re.MULTILINE)
     assert "ISO 7626-5" in out
     assert code == 1
     assert err.count("\n") == 1

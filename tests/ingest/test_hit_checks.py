@@ -100,7 +100,7 @@ def test_overload_of_the_hammer_rejects_the_hit_and_of_a_response_only_its_chann
     assert hit.rejected_channels == {"a1"}
     assert checked(replace(record, force_full_scale=1.1 * peak)).accepted
     beyond = checked(replace(record, force_full_scale=0.5 * peak))
-    assert "reaches 200% of its full scale, which no input can: correct it in test.toml" in beyond.reason
+    assert "reaches 200 % of its full scale, which no input can: correct it in test.toml" in beyond.reason
 
 
 @pytest.mark.parametrize(("peak_n", "limit_n"), [(0.05, 0.2), (100.0, None), (3e4, None), (5e5, 4e4)])

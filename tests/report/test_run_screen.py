@@ -7,6 +7,8 @@ import io
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
 
 import pytest
 from bench import ema, write_bench
@@ -14,8 +16,12 @@ from rich.console import Console
 
 from ema_pipeline.commands.screen import program
 from ema_pipeline.report import run_screen
+from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.run_screen import SCREEN_LINES
 from ema_pipeline.report.tables import Row, Table
+
+if TYPE_CHECKING:
+    from ema_pipeline.modal.types import ModalModel
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
@@ -113,6 +119,14 @@ def test_a_run_without_a_model_shows_its_modes_as_a_table(
     assert text.startswith("3 modes from ")
     assert len(text.splitlines()) <= SCREEN_LINES
     assert len(re.findall(r"^[! ] +\d +[\d.]+ ± [\d.]+ +[\d.]+ ± [\d.]+ ", text, flags=re.MULTILINE)) == 3
+
+
+def test_one_mode_has_one_frequency() -> None:
+    modal = SimpleNamespace(modes=(SimpleNamespace(frequency_hz=60.01),))
+    results = RunResults(
+        "", configurations=(ConfigurationResults("default", modal=cast("ModalModel", modal)),)
+    )
+    assert run_screen.verdict_line(results) == "1 mode at 60.01 Hz; no model was named (--rig)."
 
 
 def test_the_command_is_shown_as_it_can_be_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
