@@ -6,6 +6,7 @@ A unit is looked up in a table, never inferred: an unknown spelling is an error 
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from ema_pipeline.errors import EmaError, did_you_mean
@@ -144,8 +145,14 @@ def find_unit(text: str) -> Unit | None:
     return next((u for symbol, u in UNITS.items() if symbol.casefold() == folded and symbol != "MN"), None)
 
 
-def parse_unit(text: str) -> Unit:
+def parse_unit(text: str, quantities: Collection[str] = tuple(SI_SYMBOL)) -> Unit:
     """Return the unit that `text` spells.
+
+    Parameters
+    ----------
+    text : str
+    quantities : collection of str, optional
+        Those of which one is meant: a message names no units of others.
 
     Raises
     ------
@@ -154,5 +161,6 @@ def parse_unit(text: str) -> Unit:
     """
     unit = find_unit(text)
     if unit is None:
-        raise EmaError(f"unknown unit '{text}'{did_you_mean(text, UNITS)}")
+        known = [symbol for symbol, u in UNITS.items() if u.quantity in quantities]
+        raise EmaError(f"unknown unit '{text}'{did_you_mean(text, known)}")
     return unit

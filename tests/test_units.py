@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from ema_pipeline.errors import EmaError
@@ -82,6 +84,13 @@ def test_an_unknown_unit_is_never_guessed(text: str) -> None:
     assert find_unit(text) is None
     with pytest.raises(EmaError, match="unknown unit"):
         parse_unit(text)
+
+
+def test_only_units_of_what_is_measured_are_named_for_an_unknown_one() -> None:
+    with pytest.raises(EmaError) as caught:
+        parse_unit("furlong/h", ("acceleration", "voltage"))
+    (known,) = re.findall(r"\(known: (.*)\)$", str(caught.value))
+    assert {UNITS[symbol].quantity for symbol in known.split(", ")} == {"acceleration", "voltage"}
 
 
 def test_the_same_unit_in_two_spellings_is_the_same() -> None:

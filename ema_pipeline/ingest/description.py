@@ -111,7 +111,7 @@ class ChannelDescription(Settings):
     @property
     def parsed_unit(self) -> Unit:
         """The channel's unit, looked up."""
-        return parse_unit(self.unit)
+        return parse_unit(self.unit, (self.quantity, "voltage"))
 
 
 class RecordDescription(Settings):
