@@ -211,6 +211,7 @@ def test_axis_begins_with_the_modes_and_the_legend_has_what_the_chart_has(
     of_chart, of_frf = (entries.format(find.format(axis)) for axis in ("stab.x", "frf.x"))
     assert set(tab.evaluate(of_chart)) == {"mode indicator (log)", "stands for a mode"}
     assert set(tab.evaluate(of_frf)) == {"measured ± 2σ", "measured"}  # there is no model without a rig
+    assert tab.evaluate("[-1, 0, 12].map(EmaNumbers.power)") == ["10⁻¹ ", "", "10¹² "]
     tab.close()
 
 

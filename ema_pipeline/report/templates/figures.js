@@ -92,7 +92,7 @@ function EmaFigures(page) {
       var mode = currentMode(), circle = mode && mode.circles[chosen.circle];
       var angle = []; for (var k = 0; k <= 120; k++) { angle.push(2 * Math.PI * k / 120); }
       var power = circle ? Math.floor(Math.log10(2 * circle.radius)) : 0, k1 = Math.pow(10, -power), c0 = named(chosen.mode[0]);
-      var unit = (power ? "10^" + power + " " : "") + "(m/s)/" + (c0.scale || "N");
+      var unit = EmaNumbers.power(power) + "(m/s)/" + (c0.scale || "N");
       function scaled(values) { return values.map(function (v) { return k1 * v; }); }
       set("nyquist", "nyquist.x_axis", { axis_label: "Re mobility, " + unit }); set("nyquist", "nyquist.y_axis", { axis_label: "Im mobility, " + unit });
       columns("nyquist", "nyquist.points", circle ? { re: scaled(circle.re), im: scaled(circle.im), f: circle.f } : empty(["re", "im", "f"]));

@@ -107,5 +107,10 @@ var EmaNumbers = (function () {
     }
     return ticks;
   }
-  return { unpacked: unpacked, row: row, levels: levels, modelled: modelled, ticksOf: ticksOf };
+  /* A power of ten before a unit; nothing for 10⁰. */
+  function power(exponent) {
+    var digits = String(exponent).replace(/[-0-9]/g, function (c) { return "⁻⁰¹²³⁴⁵⁶⁷⁸⁹".charAt("-0123456789".indexOf(c)); });
+    return exponent ? "10" + digits + " " : "";
+  }
+  return { unpacked: unpacked, row: row, levels: levels, modelled: modelled, ticksOf: ticksOf, power: power };
 }());
