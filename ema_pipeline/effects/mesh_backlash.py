@@ -5,14 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ema_pipeline.effects.base import Effect, EffectParameter
+from ema_pipeline.effects.places import MESH, meshes
 from ema_pipeline.mechanics.assembly import Assembly, Element, Spring
 from ema_pipeline.mechanics.laws import PartingSpring
-
-_MESH = " mesh"
-
-
-def _places(assembly: Assembly) -> tuple[str, ...]:
-    return tuple(e.name.removesuffix(_MESH) for e in assembly.springs(suffix=_MESH))
 
 
 def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
@@ -32,7 +27,7 @@ def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assemb
             gap=gap,
         )
 
-    return assembly.edit([place + _MESH], let_part)
+    return assembly.edit([place + MESH], let_part)
 
 
 EFFECT = Effect(
@@ -60,7 +55,7 @@ EFFECT = Effect(
             "travel from separation to contact of the tooth backs",
         ),
     ),
-    find_places=_places,
+    find_places=meshes,
     edit=_edit,
     signs="mesh modes fall as the hammer's force grows; coherence dips at their resonances",
     reference="A. Kahraman, R. Singh, J. Sound Vib. 142 (1990) 49-75",

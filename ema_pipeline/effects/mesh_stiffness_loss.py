@@ -6,13 +6,8 @@ import dataclasses
 from collections.abc import Mapping
 
 from ema_pipeline.effects.base import Effect, EffectParameter
+from ema_pipeline.effects.places import MESH, meshes
 from ema_pipeline.mechanics.assembly import Assembly, Element, Spring
-
-_MESH = " mesh"
-
-
-def _places(assembly: Assembly) -> tuple[str, ...]:
-    return tuple(e.name.removesuffix(_MESH) for e in assembly.springs(suffix=_MESH))
 
 
 def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
@@ -20,7 +15,7 @@ def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assemb
         assert isinstance(element, Spring)
         return dataclasses.replace(element, stiffness=element.stiffness * (1 - values["fraction"]))
 
-    return assembly.edit([place + _MESH], weaken)
+    return assembly.edit([place + MESH], weaken)
 
 
 EFFECT = Effect(
@@ -31,7 +26,7 @@ EFFECT = Effect(
             "fraction", "1", 0.0, 0.3, 0.3, 0.0, 0.99, "fraction of the mesh stiffness that is lost"
         ),
     ),
-    find_places=_places,
+    find_places=meshes,
     edit=_edit,
     signs="mode pairs split and mesh modes fall; a mode is concentrated on one planet",
     reference="F. Chaari et al., Eur. J. Mech. A/Solids 25 (2006) 325-340",

@@ -10,6 +10,10 @@ ALL = "all"
 """Place of an effect that sits on all bodies at once."""
 
 
+MESH = " mesh"
+"""End of the name of a mesh's spring; what stands before it is the place."""
+
+
 def is_planet(body: str) -> bool:
     """True for ``planet1``, ``planet2`` …"""
     return re.fullmatch(r"planet\d+", body) is not None
@@ -24,6 +28,11 @@ def bodies_with_bearings(assembly: Assembly) -> tuple[str, ...]:
     """Bodies on a bearing to ground: springs ``body bearing x`` and ``body bearing y``."""
     names = {e.name for e in assembly.elements}
     return tuple(b for b in assembly.bodies if {f"{b} bearing x", f"{b} bearing y"} <= names)
+
+
+def meshes(assembly: Assembly) -> tuple[str, ...]:
+    """Gear meshes, by the pair of gears in mesh."""
+    return tuple(e.name.removesuffix(MESH) for e in assembly.springs(suffix=MESH))
 
 
 def bodies_in_plane(assembly: Assembly) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ema_pipeline.report.moving_shapes import UNITS, outline_path
+from ema_pipeline.report.moving_shapes import UNITS, in_units, outline_path
 from ema_pipeline.rigs.drawing import Body, Drawing
 
 _LARGEST_GAP = 0.35
@@ -57,9 +57,9 @@ def effect_places(drawing: Drawing | None, places: Sequence[str]) -> EffectPlace
         if len(group) == 2 and all(name in by_name for name in group):
             meeting = _meeting(by_name[group[0]], by_name[group[1]])
             if meeting is not None:
-                marks.append((_n(meeting[0]), _n(-meeting[1])))
+                marks.append((in_units(meeting[0]), in_units(-meeting[1])))
     bodies = tuple(
-        DrawnBody(b.name, outline_path(b), _n(b.x), _n(-b.y), b.form, b.fill, b.name in named)
+        DrawnBody(b.name, outline_path(b), in_units(b.x), in_units(-b.y), b.form, b.fill, b.name in named)
         for b in drawing.bodies
     )
     reach = 1.08 * drawing.reach * UNITS
@@ -76,7 +76,3 @@ def _meeting(a: Body, b: Body) -> tuple[float, float] | None:
         return None
     share = outer.radius / distance
     return outer.x + share * (inner.x - outer.x), outer.y + share * (inner.y - outer.y)
-
-
-def _n(value: float) -> float:
-    return round(float(value) * UNITS, 2)

@@ -106,18 +106,18 @@ def _drawn(stem: str, drawing: Drawing, moved: dict[str, Motion], scale: float, 
     for body in drawing.bodies:
         motion = moved[body.name]
         x, y, turn = body.displaced(motion, scale)
-        place = f"translate({_n(x):g} {_n(y):g}) rotate({np.rad2deg(turn):.2f})"
+        place = f"translate({in_units(x):g} {in_units(y):g}) rotate({np.rad2deg(turn):.2f})"
         bodies.append(
             MovingBody(
                 body.form,
                 body.fill,
                 f"{stem}-{body.like}",
                 place,
-                f"translate({_n(body.x):g} {_n(body.y):g})",
+                f"translate({in_units(body.x):g} {in_units(body.y):g})",
                 "u" not in motion.missing,
-                _n(0.85 * body.radius),
-                _n(body.radius + 0.35),
-                tuple((_n(x), _n(y)) for x, y in body.arms),
+                in_units(0.85 * body.radius),
+                in_units(body.radius + 0.35),
+                tuple((in_units(x), in_units(y)) for x, y in body.arms),
             )
         )
         u = complex(motion.u) * scale / body.radius * 180 / np.pi
@@ -133,5 +133,6 @@ def outline_path(body: Body) -> str:
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points[:-1]) + "Z"
 
 
-def _n(value: float) -> float:
+def in_units(value: float) -> float:
+    """A length of the drawing in `UNITS`, rounded for SVG."""
     return round(float(value) * UNITS, 2)

@@ -21,7 +21,7 @@ from ema_pipeline.report.shown_band import shown_to
 
 # Okabe & Ito (2008), "Color universal design": told apart with every common colour vision deficiency.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
+BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
 GREY, LIGHT = "#6b6b6b", "#d9d9d9"
 
 MEASURED, MODEL, SECOND = BLUE, VERMILLION, GREEN
