@@ -77,7 +77,7 @@ def test_no_channel_of_the_shipped_demo_is_called_clipped(capsys: pytest.Capture
     demo = Path(__file__).parents[2] / "sample_data" / "hidden_effect"
     code, out, _ = ema(capsys, "check", demo)
     assert code == 0
-    assert re.findall(r"clipping +\S+ % +\S+ % +(\S+)", out) == ["PASS", "PASS"]
+    assert re.findall(r"clipping +≤ \S+ % +\S+ % +(\S+)", out) == ["PASS", "PASS"]
     assert "left out" not in out
 
 
