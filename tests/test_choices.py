@@ -33,7 +33,7 @@ from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report.html import report_html
-from ema_pipeline.report.moved_modes import error_words, moved_table, seen, still
+from ema_pipeline.report.moved_modes import error_words, moved_table, seen, still_words
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.results_folder import LOCK_FILE
 from ema_pipeline.run.opening import existing_run
@@ -217,7 +217,7 @@ def test_an_excluded_mode_is_not_compared_and_the_others_stay(out: Path) -> None
     assert len(found.pairing.pairs) == 2
     table = moved_table(seen(before), seen(after))
     assert [row.cells[-1] for row in table.rows] == ["gone"]
-    assert still(seen(before), seen(after)) == 2
+    assert still_words(seen(before), seen(after)) == "2 modes stayed within a twentieth of their uncertainty."
     with pytest.raises(EmaError, match="no mode within 1 %"):
         change_choices(out, excluding(modes=[f"{all_hz[1]:.1f}"]))
     run_on(out, ["diagnose"])

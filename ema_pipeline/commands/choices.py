@@ -10,7 +10,6 @@ import typer
 
 from ema_pipeline.commands.options import EffectFiles, Json, Out, Quiet
 from ema_pipeline.commands.screen import progress, show, show_json, show_old_diagnosis
-from ema_pipeline.number_text import counted
 
 if TYPE_CHECKING:
     from ema_pipeline.choosing import Change
@@ -68,7 +67,7 @@ def _change(out: Path, change: Change, effect_files: list[str], quiet: bool, jso
     """Change the choices, and print modes and errors before and after."""
     from ema_pipeline.choosing import change_choices
     from ema_pipeline.report import terminal
-    from ema_pipeline.report.moved_modes import error_words, moved_table, seen, still
+    from ema_pipeline.report.moved_modes import error_words, moved_table, seen, still_words
     from ema_pipeline.report.summary_files import choices_summary, finite
     from ema_pipeline.run.opening import existing_run
     from ema_pipeline.stages.results import load_results
@@ -88,11 +87,10 @@ def _change(out: Path, change: Change, effect_files: list[str], quiet: bool, jso
         return
     if quiet:
         return
-    table, unmoved = moved_table(before, after), still(before, after)
+    table, unmoved = moved_table(before, after), still_words(before, after)
     if table.rows:
         show(terminal.text_table(table, "Modes before and after"))
     if unmoved:
-        whose = "its" if unmoved == 1 else "their"
-        show(f"{counted(unmoved, 'mode')} stayed within a twentieth of {whose} uncertainty.")
+        show(unmoved)
     show(error_words(before, after) or "Nothing has changed.")
     show_old_diagnosis(results, out)

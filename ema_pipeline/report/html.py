@@ -17,7 +17,7 @@ from ema_pipeline.number_text import format_percent, format_value, plain, signed
 from ema_pipeline.report import diagnosis, diagnosis_tables, levels, summary, tables
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.loops import loops_context
-from ema_pipeline.report.moved_modes import Seen, error_words, moved_table, still
+from ema_pipeline.report.moved_modes import Seen, error_words, moved_table, still_words
 from ema_pipeline.report.moving_shapes import moving_shapes
 from ema_pipeline.report.name_text import slug, words
 from ema_pipeline.report.page_top import page_top
@@ -193,7 +193,7 @@ def _moved(before: Seen, after: Seen) -> dict[str, Any]:
     table = moved_table(before, after)
     return {
         "table": table if table.rows else None,
-        "still": still(before, after),
+        "still": still_words(before, after),
         "words": error_words(before, after),
     }
 

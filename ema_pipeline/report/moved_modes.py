@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ema_pipeline.number_text import plain
+from ema_pipeline.number_text import counted, plain
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.report.tables import Row, Table
 
@@ -97,9 +97,11 @@ def moved_table(before: Seen, after: Seen) -> Table:
     return Table(head, tuple(rows), frozenset(range(1 if several else 0, len(head))))
 
 
-def still(before: Seen, after: Seen) -> int:
-    """How many modes stayed where they were."""
-    return sum(o is not None and n is not None and _moved(o, n) < LITTLE for o, n in _paired(before, after))
+def still_words(before: Seen, after: Seen) -> str:
+    """How many modes stayed where they were, in a sentence; empty where none did."""
+    count = sum(o is not None and n is not None and _moved(o, n) < LITTLE for o, n in _paired(before, after))
+    whose = "its" if count == 1 else "their"
+    return f"{counted(count, 'mode')} stayed within a twentieth of {whose} uncertainty." if count else ""
 
 
 def error_words(before: Seen, after: Seen) -> str:
