@@ -195,13 +195,17 @@ def _driving_points(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[
         if crossed <= limit and not told & {one, other}:
             told |= {one, other}
             verdicts.append(_exchanged(frfs, one, other, max(wrong[one], wrong[other]), limit))
-    driver, keys = ("force", "'dof'") if frfs.excitation else ("hammer", "'impact' and 'dof'")
+    driver, keys = ("force", "'dof'") if frfs.excitation else ("hammer", "'impact', 'dof'")
     for o in sorted(set(own) - told):
         output = frfs.outputs[o]
         if wrong[o] > REVERSED:
-            what = f"point the wrong way; sensor or {driver} is reversed, put '-' before its dof"
+            # displacement mistaken for acceleration, or the other way round, looks alike
+            what = f"point the wrong way: sensor or {driver} reversed (put '-' before its dof), or its quantity wrong"
         else:
-            what = f"differ in sign; {driver} and sensor are not at one point: look up {keys} in test.toml"
+            what = (
+                f"differ in sign; {driver} and sensor are not at one point, or its quantity is wrong: look up {keys} "
+                "and 'quantity' in test.toml"
+            )
         fault, name = f"driving point {output}: resonances {what}", f"{output} over {output}"
         passes = wrong[o] <= limit
         verdicts.append(
