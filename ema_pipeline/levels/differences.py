@@ -37,12 +37,16 @@ PLAIN = 2.0
 
 @dataclass(frozen=True)
 class Solved:
-    """Per hit and mode: pole and participation, and the standard deviations of their parts."""
+    """Per hit and mode: pole and participation, and the standard deviations of their parts; participation in the mean.
+
+    Where a hit's pole is not known, its participation may be anything: at lines without force its FRFs are noise.
+    """
 
     poles: Complex
     std: Real
     participation: Complex
     participation_std: Real
+    mean_participation: Complex
 
 
 def solve(
@@ -79,7 +83,7 @@ def solve(
     columns = np.concatenate([shapes.T[:, :, None] * start[:, None] * du, along], axis=1)
     if n_hits == 1:
         unknown = np.full((1, m), np.inf)
-        return Solved(poles[None], unknown, start[None], unknown)
+        return Solved(poles[None], unknown, start[None], unknown, start)
     moved = _of_mean(omega, poles, shapes, rest_s, start, mean, scale * np.sqrt(total), smooth)
     if np.any(np.abs(moved - poles) > -CURVED * poles.real):
         poles = moved
@@ -115,7 +119,7 @@ def solve(
         )
         both = np.tile(large[h], 2)  # what the hit hardly tells of may have gone astray
         solution[h, both] = better[both]
-    return Solved(poles + solution[:, :m], std, start + solution[:, m:], deviations[:, m:])
+    return Solved(poles + solution[:, :m], std, start + solution[:, m:], deviations[:, m:], start)
 
 
 def participations(omega: Real, frf: Complex, poles: Complex, shapes: Complex, rest_s: float) -> Complex:

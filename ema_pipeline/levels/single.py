@@ -172,7 +172,8 @@ def single_hits(hits: Hits, modal: ModalModel, frfs: FrfSet, frf_settings: FrfSe
             size_std[np.ix_(index, m)] = np.where(heard, solved.participation_std, np.inf)
             if members[0].calibrated:
                 impulse = np.array([h.impulse[m] for h in members])
-                moved = 2 * solved.participation * impulse / poles[m] ** 2
+                participation = np.where(known, solved.participation, solved.mean_participation)
+                moved = 2 * participation * impulse / poles[m] ** 2
                 motion[np.ix_(index, m)] = moved
                 amplitude[np.ix_(index, m)] = np.abs(moved) * np.abs(seen[m]).max(axis=1)
     physical = pole + decay

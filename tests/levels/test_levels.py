@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import HitSamples, cut_hit
-from ema_pipeline.levels import LevelSettings, LevelStudy, study_levels
+from ema_pipeline.levels import LevelSettings, LevelStudy, single, study_levels
+from ema_pipeline.levels.differences import Solved
 from ema_pipeline.levels.sentences import flagged
 from ema_pipeline.levels.single import single_hits
 from ema_pipeline.levels.sizes import plain_damping, relative_sizes, sizes_at_levels
@@ -139,6 +141,28 @@ def test_poles_of_single_hits_scatter_as_their_standard_deviations_say() -> None
     assert np.all((z[soft].std(axis=0) > 0.5) & (z[soft].std(axis=0) < 1.7))
     z = (found.damping_ratio - true_damping) / found.damping_std
     assert np.all((z[soft].std(axis=0) > 0.5) & (z[soft].std(axis=0) < 1.7))
+
+
+def test_a_hit_that_tells_nothing_of_a_mode_moves_it_as_the_mean_of_its_point_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Fits of such hits go astray: motions of metres made every law that depends on the amplitude impossible."""
+    hits = hits_of(LINEAR, np.random.default_rng(2))
+    modal = identify(frfs := estimate_frfs(hits), ModalSettings())
+    true = single_hits(lambda: hits, modal, frfs, FrfSettings()).motion_m
+    solved = single.solve
+
+    def astray(*given: Any) -> Solved:
+        found = solved(*given)
+        participation, std = found.participation.copy(), found.std.copy()
+        participation[0], std[0] = 1e10, np.inf
+        return replace(found, participation=participation, std=std)
+
+    monkeypatch.setattr(single, "solve", astray)
+    found = single_hits(lambda: hits, modal, frfs, FrfSettings())
+    first = [int(np.argmax(found.sheet == s)) for s in np.unique(found.sheet)]
+    assert not np.any(np.isfinite(found.frequency_std_hz[first]))
+    np.testing.assert_allclose(found.motion_m[first], true[first], rtol=0.05)
 
 
 def test_sizes_of_single_hits_scatter_as_their_standard_deviations_say() -> None:
