@@ -330,15 +330,22 @@ def test_ctrl_c_is_the_end_of_a_page_and_no_interruption(page: Page) -> None:
     assert page.process.stderr.read() == "ema: stopped; all changes are kept\n"
 
 
-def test_server_stopped_amid_a_refit_leaves_the_folder_as_it_was(page: Page, out: Path) -> None:
-    before = (out / "ema.h5").read_bytes()
+def begin_refit(page: Page, out: Path) -> None:
+    """Add an effect, and return once the fit with it is under way."""
     own = {
         "Cookie": page.enter().partition(";")[0],
         "Origin": page.origin,
         "Content_Type": "application/json",
     }
-    assert page.ask("POST", "/action", json.dumps({"verb": "diagnose"}), **own).status == 202
-    time.sleep(1.5)
+    assert page.ask("POST", "/action", json.dumps({"verb": "add", "label": CULPRIT}), **own).status == 202
+    deadline = time.monotonic() + 30
+    while not existing_run(out).info.effects and time.monotonic() < deadline:
+        time.sleep(0.02)
+
+
+def test_server_stopped_amid_a_refit_leaves_the_folder_as_it_was(page: Page, out: Path) -> None:
+    before = (out / "ema.h5").read_bytes()
+    begin_refit(page, out)
     assert page.stop() == 0
     assert page.process.stderr is not None
     said = page.process.stderr.read()
@@ -349,15 +356,7 @@ def test_server_stopped_amid_a_refit_leaves_the_folder_as_it_was(page: Page, out
 
 
 def test_server_that_is_killed_leaves_whole_results_and_nothing_behind(page: Page, out: Path) -> None:
-    own = {
-        "Cookie": page.enter().partition(";")[0],
-        "Origin": page.origin,
-        "Content_Type": "application/json",
-    }
-    assert page.ask("POST", "/action", json.dumps({"verb": "add", "label": CULPRIT}), **own).status == 202
-    deadline = time.monotonic() + 30
-    while not existing_run(out).info.effects and time.monotonic() < deadline:
-        time.sleep(0.02)
+    begin_refit(page, out)
     page.process.kill()
     page.process.wait()
     time.sleep(0.5)
