@@ -338,7 +338,7 @@ def checks_table(hits: Sequence[Hit]) -> Table:
 def _direction(verdicts: Sequence[CheckResult]) -> str:
     """Whether a limit is the least or the most, as its verdicts tell; empty where it is neither, or both."""
     at_least = {v.passes == (v.value > v.limit) for v in verdicts if v.value != v.limit}
-    return "" if len(at_least) != 1 else "≥ " if True in at_least else "≤ "
+    return "≥ " if at_least == {True} else "≤ " if at_least == {False} else ""
 
 
 def failed_checks_table(verdicts: Sequence[CheckResult]) -> Table:
