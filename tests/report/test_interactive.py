@@ -230,7 +230,11 @@ def test_a_page_that_is_printed_has_figures_that_were_never_in_view_and_a_narrow
     )
     assert tab.evaluate(of_legend) == "horizontal"
     tab.set_viewport_size({"width": 400, "height": 700})
-    tab.wait_for_function(f"{of_legend} === 'vertical'", timeout=10_000)
+    for _ in range(100):  # the page forbids the evaluation that Playwright's own waiting needs
+        if tab.evaluate(of_legend) == "vertical":
+            break
+        tab.wait_for_timeout(100)
+    assert tab.evaluate(of_legend) == "vertical"
     tab.close()
 
 
