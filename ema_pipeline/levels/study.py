@@ -82,7 +82,7 @@ def study_levels(
         `single.single_hits` and `trend.trends`. Where something moves, the modes are those of the level nearest to
         the linear structure, see `linear`, less what the nonlinearity made, see `harmonics`.
     """
-    from ema_pipeline.levels.harmonics import without_products
+    from ema_pipeline.levels.harmonics import without_faint, without_products
     from ema_pipeline.levels.linear import linear_level
     from ema_pipeline.levels.one_level import decays_of, from_decays
     from ema_pipeline.levels.sentences import one_level, several_levels
@@ -128,10 +128,10 @@ def study_levels(
     linear: int | None = None
     products: tuple[str, ...] = ()
     if depends and (linear := linear_level(levels, modes, frfs)) is not None:
-        if (
-            linear == 0
-        ):  # friction makes poles of all kinds: there the softest hits do not tell which are modes
+        if linear == 0:
             levels, products = without_products(levels, modes, modal)
+        else:
+            levels, products = without_faint(levels, linear)
         modal = levels[linear].modal or modal
         # what was seen to move may have been left out
         modes, _, hit_modes = tested(modal, one_at_least=not products)

@@ -14,7 +14,14 @@ from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.levels import LevelSettings, LevelStudy, study_levels
-from ema_pipeline.levels.harmonics import growth, may_be_products, product_of, without, without_products
+from ema_pipeline.levels.harmonics import (
+    growth,
+    may_be_products,
+    product_of,
+    without,
+    without_faint,
+    without_products,
+)
 from ema_pipeline.levels.linear import structure
 from ema_pipeline.levels.study import with_circles
 from ema_pipeline.modal.circle.settings import CircleSettings
@@ -120,6 +127,31 @@ def test_poles_at_multiples_of_what_moves_are_no_modes(
     assert len(products) == 1
     assert products[0].startswith("390.6 Hz (3 × 130")
     assert cleaned[0].modal is soft
+
+
+def test_poles_that_hardly_move_are_no_modes_where_the_hardest_hits_are_nearest_to_a_linear_structure(
+    hardening: tuple[LevelStudy, ModalModel, FrfSet],
+) -> None:
+    study, _, _ = hardening
+    hard = study.levels[2].modal
+    assert hard is not None
+    assert hard.scaled
+    one = hard.modes[2]
+    third, faint = (replace(at(hz, one), shape=0.04 * one.shape) for hz in (3 * 130.2, 313.0))
+    moving = at(300.0, one)
+    made = replace(hard, modes=(*hard.modes, moving, faint, third))
+    levels = (*study.levels[:2], replace(study.levels[2], modal=made))
+    cleaned, products = without_faint(levels, 2)
+    assert cleaned[2].modal is not None
+    assert cleaned[2].modal.modes == (*hard.modes, moving)
+    assert [cleaned[k].modal for k in (0, 1)] == [levels[k].modal for k in (0, 1)]
+    assert products == ("313, 390.6 Hz (hardly moving)",)
+    # what the softest hits show as well is a mode, however little it moves
+    seen = (replace(levels[0], modal=made), *levels[1:])
+    assert without_faint(seen, 2) == (seen, ())
+    # shapes of no scale do not tell
+    unscaled = (*levels[:2], replace(levels[2], modal=replace(made, scaled=False)))
+    assert without_faint(unscaled, 2) == (unscaled, ())
 
 
 def test_a_pole_that_grows_with_the_force_is_no_mode_though_nothing_else_moves() -> None:
