@@ -133,21 +133,18 @@ def _ends(values: Real, stds: Real, shift: Real | None, shift_std: Real | None, 
     """Value and standard deviation at the softest and the hardest level.
 
     From the FRFs of the levels where these show the change; where they do not (impact points that move a mode by
-    different amounts smear it), from the differences between single hits.
+    different amounts smear it), from the differences between single hits. None where these show no such change, or one
+    to a value that there is not: a mode that moves by more than its width.
     """
     if len(values) < 2 or not np.isfinite(values[0]):
         return None
     change, noise = float(values[-1] - values[0]), float(np.hypot(stds[0], stds[-1]))
     if np.isfinite(change) and sign * change > CLEAR * noise:
         return float(values[0]), float(stds[0]), float(values[-1]), float(stds[-1])
-    if shift is None or shift_std is None or not np.isfinite(shift[-1]):
+    if shift is None or shift_std is None or not sign * shift[-1] > 0 or values[0] + shift[-1] <= 0:
         return None
-    return (
-        float(values[0]),
-        float(stds[0]),
-        float(values[0] + shift[-1]),
-        float(np.hypot(stds[0], shift_std[-1])),
-    )
+    hard = float(values[0] + shift[-1])
+    return float(values[0]), float(stds[0]), hard, float(np.hypot(stds[0], shift_std[-1]))
 
 
 def _size_ends(mode: ModeLevels) -> Ends | None:
