@@ -96,7 +96,7 @@ def sizes_of(hypothesis: Hypothesis, name: Name, fit: Fit) -> dict[str, EffectSi
         else:
             size = SizeMap.of(own, name.scales.get(own.name, own.scale))
             value, slope = size.value(x * ratio), size.slope(x * ratio) * ratio
-        found[own.name] = EffectSize(value, std * abs(slope), own.unit)
+        found[own.name] = EffectSize(value, std * abs(slope), own.unit, size.learned(fit.posterior, i))
     return found
 
 

@@ -101,7 +101,8 @@ def parameter_sizes(problem: EffectProblem, posterior: Posterior) -> dict[str, E
         size = problem.sizes.get(name)
         slope = abs(size.slope(float(posterior.x[i]))) if size is not None else abs(value)
         std = float(np.sqrt(posterior.of_sums([made_up_of(problem, name)])[0][0, 0]))
-        found[name] = EffectSize(value, std * slope, "" if size is None else size.parameter.unit)
+        unit = "" if size is None else size.parameter.unit
+        found[name] = EffectSize(value, std * slope, unit, size is None or size.learned(posterior, i))
     return found
 
 

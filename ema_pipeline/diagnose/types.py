@@ -30,16 +30,17 @@ _UNDETERMINED = 100.0
 
 @dataclass(frozen=True)
 class EffectSize:
-    """A fitted size; `std` is 1 σ."""
+    """A fitted size; `std` is 1 σ. `learned` is False where the data leave its prior as it was."""
 
     value: float
     std: float
     unit: str
+    learned: bool = True
 
     @property
     def determined(self) -> bool:
         """False where the data say nothing of it: a free gap that never closes stays where its fit began."""
-        return self.value == 0.0 or not self.std > _UNDETERMINED * abs(self.value)
+        return self.learned and (self.value == 0.0 or not self.std > _UNDETERMINED * abs(self.value))
 
 
 @dataclass(frozen=True)

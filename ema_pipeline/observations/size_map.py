@@ -7,9 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ema_pipeline.effects.base import EffectParameter
+from ema_pipeline.inference import Posterior
 
 LOG_STD = 1.2
 """Prior 1 σ of the logarithm of a size that has no null: within a factor of three of its start, mostly."""
+_AS_BEFORE = 0.95
+"""Share of its prior 1 σ that such a size keeps, from which the data tell nothing of it."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,12 @@ class SizeMap:
     def coordinate_slope(self, x: float) -> float:
         """Derivative of the coordinate by the unknown."""
         return LOG_STD * self.coordinate(x) if self.logarithmic else 1.0
+
+    def learned(self, posterior: Posterior, unknown: int) -> bool:
+        """False where the data tell nothing of a size that has no null: what is stated of it is its prior."""
+        return not self.logarithmic or bool(
+            posterior.std[unknown] < _AS_BEFORE * posterior.prior_std[unknown]
+        )
 
     @property
     def bounds(self) -> tuple[float, float]:

@@ -230,7 +230,7 @@ def _simulation(results: RunResults) -> dict[str, Any]:
 
 
 def _sizes(sizes: Mapping[str, EffectSize]) -> dict[str, Any]:
-    return {name: asdict(s) for name, s in sizes.items()}
+    return {name: {"value": s.value, "std": s.std, "unit": s.unit} for name, s in sizes.items()}
 
 
 def _configuration(c: ConfigurationResults) -> dict[str, Any]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -476,6 +478,17 @@ def test_sizes_are_tried_over_six_decades_of_both_signs_where_there_are_two() ->
     expected = np.linspace(-reach, reach, 5)
     np.testing.assert_allclose(_grid(times, 5), expected[(expected >= low) & (expected <= high)])
     assert _grid(times, 1).tolist() == [0.0]
+
+
+@pytest.mark.parametrize(("std", "learned"), [(1.0, False), (0.9, True)])
+def test_the_data_tell_nothing_of_a_size_without_a_null_whose_prior_they_leave(
+    std: float, learned: bool
+) -> None:
+    posterior = cast(Posterior, SimpleNamespace(std=np.array([std]), prior_std=np.ones(1)))
+    gap = parse_effect("relaxation@isolator", isolator()).effect.parameters[1]
+    assert SizeMap.of(gap, 0.1).learned(posterior, 0) is learned
+    (spring,) = parse_effect("bearing_quadratic@rim", RIG).effect.parameters
+    assert SizeMap.of(spring, spring.scale).learned(posterior, 0)  # it may be zero, and is told to be
 
 
 def test_preloads_are_tried_from_the_largest_down_to_where_nothing_leads_anywhere() -> None:

@@ -24,4 +24,6 @@ def test_a_size_that_the_data_do_not_determine_is_not_given() -> None:
     }
     assert size_text(sizes) == "preload 270.0 ± 6.0 nm, gap not determined by these data"
     assert "gap not determined by these data" in size_words(sizes)
+    sizes["mesh_backlash@m.gap"] = EffectSize(1e-4, 1.2e-4, "m", learned=False)
+    assert size_text(sizes) == "preload 270.0 ± 6.0 nm, gap not determined by these data"
     assert "force 0.0 ± 1.4 N" in size_words({"dry_friction@m.force": EffectSize(0.0, 1.4, "N")})
