@@ -19,7 +19,7 @@ from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import averaged_size, in_said_names, sizes_of
 from ema_pipeline.diagnose.next_test import next_measurement
 from ema_pipeline.diagnose.probability import CLOSEST, against_nothing, complete, shared
-from ema_pipeline.diagnose.rungs import learned_scatters, noise, rungs_of
+from ema_pipeline.diagnose.rungs import as_calculated, learned_scatters, noise, rungs_of
 from ema_pipeline.diagnose.score import scores
 from ema_pipeline.diagnose.selection import Progress, Selection, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -295,16 +295,22 @@ def _candidates(
         elif anew:
             probabilities |= {label: told * share for label, share in shares.items()}
             told = probabilities[j.named.label]
-        mine.append(replace(_candidate(j, told, True), parameters=sizes))
+        mine.append(_candidate(j, sizes, told, True))
     taken = {c.label for c in mine}
     others = {j.named.label: j for j in (*last.judged, *group) if j.named.label not in taken}
     rest = sorted(others.values(), key=lambda j: (j.named.label not in shares, -j.gain))
     shown = rest[: max(settings.candidates, len(mine) + len(group)) - len(mine)]
-    told_of = [_candidate(j, probabilities.get(j.named.label, 0.0), False) for j in shown]
+    told_of = [_candidate(j, _stated(found, j), probabilities.get(j.named.label, 0.0), False) for j in shown]
     return (*mine, *sorted(told_of, key=lambda c: -c.probability))
 
 
-def _candidate(j: Judged, probability: float, claimed: bool) -> Candidate:
+def _stated(found: Selection, j: Judged) -> dict[str, EffectSize]:
+    """Sizes of what is not in the model, as they would be stated if it were."""
+    by_motion = not j.hypothesis.placed.effect.linear and found.observations.linearised
+    return {n: as_calculated(s) if by_motion else s for n, s in j.named.sizes.items()}
+
+
+def _candidate(j: Judged, sizes: dict[str, EffectSize], probability: float, claimed: bool) -> Candidate:
     effect = j.named.name.placed.effect
     why = f"Its signs: {effect.signs}." if claimed or j.claimed else f"Not claimed: {j.doubt}."
     return Candidate(
@@ -312,7 +318,7 @@ def _candidate(j: Judged, probability: float, claimed: bool) -> Candidate:
         at=j.named.name.placed.place,
         title=effect.title,
         probability=probability,
-        parameters=dict(j.named.sizes),
+        parameters=sizes,
         error_before=j.base.posterior.error,
         error_after=j.after.posterior.error,
         heldout_error_before=j.held_before.error,

@@ -77,17 +77,19 @@ def rung_at(observations: Observations, fit: Fit, scatters: Mapping[str, float])
     )
 
 
+def as_calculated(size: EffectSize) -> EffectSize:
+    """A size that the motion in single hits tells, with what their calculation has wrong."""
+    wrong = (_RUBBED_STD if size.unit in ("N", "m/s") else _CALCULATED_STD) * size.value
+    return replace(size, std=float(np.hypot(size.std, wrong)))
+
+
 def _stated(
     observations: Observations, model: Model, sizes: Mapping[str, EffectSize]
 ) -> dict[str, EffectSize]:
-    """Sizes with what the calculation of single hits has wrong of those that depend on the amplitude."""
-    nonlinear = {e.label for e in model.effects if observations.linearised and not e.effect.linear}
-
-    def stated(size: EffectSize) -> EffectSize:
-        wrong = (_RUBBED_STD if size.unit in ("N", "m/s") else _CALCULATED_STD) * size.value
-        return replace(size, std=float(np.hypot(size.std, wrong)))
-
-    return {name: stated(size) if effect_of(name) in nonlinear else size for name, size in sizes.items()}
+    nonlinear = {e.label for e in model.effects if not e.effect.linear and observations.linearised}
+    return {
+        name: as_calculated(size) if effect_of(name) in nonlinear else size for name, size in sizes.items()
+    }
 
 
 def parameter_sizes(problem: EffectProblem, posterior: Posterior) -> dict[str, EffectSize]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,6 +27,8 @@ from ema_pipeline.inference import Scatter, Unknowns
 from ema_pipeline.observations.fitting import Fit, Model, fit_base
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
+
+diagnosis: Any = import_module("ema_pipeline.diagnose.diagnosis")
 
 NO_DATA: Any = object()
 
@@ -64,6 +67,19 @@ def test_a_size_that_single_hits_tell_is_no_better_known_than_it_is_calculated(
         }
     )
     assert found["cubic@x.s"].value == -5.0
+
+
+@pytest.mark.parametrize(
+    ("linear", "linearised", "std"), [(False, True, 1.5), (False, False, 0.0), (True, True, 0.0)]
+)
+def test_rivals_are_no_better_known_than_what_is_claimed(linear: bool, linearised: bool, std: float) -> None:
+    found: Any = SimpleNamespace(observations=SimpleNamespace(linearised=linearised))
+    effect = SimpleNamespace(effect=SimpleNamespace(linear=linear))
+    judged: Any = SimpleNamespace(
+        hypothesis=SimpleNamespace(placed=effect),
+        named=SimpleNamespace(sizes={"stiffness": EffectSize(5.0, 0.0, "N/m")}),
+    )
+    assert diagnosis._stated(found, judged) == {"stiffness": EffectSize(5.0, std, "N/m")}
 
 
 def test_sizes_have_the_spread_of_all_that_makes_them_up() -> None:
