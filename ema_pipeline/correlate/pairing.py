@@ -62,7 +62,9 @@ def pair(
     shapes = np.asarray(full @ rows.T, dtype=complex)
     groups = close_groups(model_f, settings.group_width)
     single, grouped = shape_agreement(measured, shapes, groups)
-    distance = _log_distance(measured.frequency_hz, model_f)
+    elastic = model_f > RIGID_HZ
+    ratio = np.maximum(measured.frequency_hz[:, None] / np.where(elastic, model_f, 1.0), 1e-12)
+    distance = np.where(elastic, np.abs(np.log(ratio)), np.inf)
     chosen = assign(distance, grouped, single, settings)
 
     taken = {k: r for r, k in chosen.items()}
@@ -183,12 +185,6 @@ def assign(
 def _shape(mode: ModelMode) -> NDArray[np.complex128]:
     complex_shape = getattr(mode, "complex_shape", None)
     return np.asarray(mode.shape if complex_shape is None else complex_shape, dtype=complex)
-
-
-def _log_distance(measured: NDArray[np.float64], model: NDArray[np.float64]) -> NDArray[np.float64]:
-    elastic = model > RIGID_HZ
-    ratio = measured[:, None] / np.where(elastic, model, 1.0)[None, :]
-    return np.where(elastic[None, :], np.abs(np.log(np.maximum(ratio, 1e-12))), np.inf)
 
 
 def _why_measured(

@@ -13,7 +13,7 @@ from scipy.special import softmax
 from ema_pipeline.diagnose import sentences
 from ema_pipeline.diagnose.claims import Judged
 from ema_pipeline.diagnose.detection_limits import detection_limits
-from ema_pipeline.diagnose.explained import explanation
+from ema_pipeline.diagnose.explained import explanation, stands_still
 from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import averaged_size, in_said_names, sizes_of
@@ -21,7 +21,7 @@ from ema_pipeline.diagnose.next_test import next_measurement
 from ema_pipeline.diagnose.probability import CLOSEST, against_nothing, complete, shared
 from ema_pipeline.diagnose.rungs import as_calculated, learned_scatters, noise, rungs_of
 from ema_pipeline.diagnose.score import scores
-from ema_pipeline.diagnose.selection import Progress, Selection, select
+from ema_pipeline.diagnose.selection import Earlier, Progress, Selection, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import (
     DOUBTFUL,
@@ -38,7 +38,7 @@ from ema_pipeline.diagnose.visible import nothing_visible
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Model
-from ema_pipeline.observations.in_full import fit_in_full
+from ema_pipeline.observations.in_full import fit_in_full, friction_in_full
 from ema_pipeline.processes import aside
 from ema_pipeline.rigs.types import Rig
 
@@ -97,6 +97,7 @@ def diagnose(
     if hypotheses is None:
         hypotheses = list_hypotheses(rig, library, known.labels, linear)
     first, faint = _selected(observations, known, hypotheses, settings, progress)
+    first = _with_friction_in_full(first, known, hypotheses, settings, progress)
     # what else there may be is told to first order, as it was looked for
     observations, final = fit_in_full(first.observations, first.final, settings.processes)
     found = replace(first, final=final, observations=observations)
@@ -232,6 +233,32 @@ def _selected(
         hypotheses = [h for h in hypotheses if h.label not in dropped]
         found = select(observations, known, hypotheses, settings, progress)
     return found, told
+
+
+def _with_friction_in_full(
+    first: Selection,
+    known: Model,
+    hypotheses: Sequence[Hypothesis],
+    settings: DiagnoseSettings,
+    progress: Progress,
+) -> Selection:
+    """The selection from data for which friction is calculated in full, where that alone finds what moves the modes.
+
+    Marched beside every rival it takes minutes: nothing is asked about but what promised most.
+    """
+    if not stands_still(first.observations, first.final):
+        return first
+    progress(0.0, "friction in full")
+    ranked = [r for of in first.rounds for r in of.ranking.ranked]
+    effects = [(r.hypothesis.placed, r.hypothesis.scales) for r in ranked]
+    found = friction_in_full(first.observations, first.rounds[0].ranking.base, effects, settings.processes)
+    if found is None:
+        return first
+    full, label, friction = found
+    asked = {r.hypothesis.label: r.hypothesis for r in ranked if r.final or r.hypothesis.label == label}
+    earlier = Earlier(tuple(asked.values()), settings.most_effects + 1, {label: friction}, closed=True)
+    again = select(full, known, hypotheses, settings, progress, earlier)
+    return first if stands_still(again.observations, again.final) else again
 
 
 def _faint(

@@ -128,10 +128,15 @@ def explanation(observations: Observations, fit: Fit, settings: DiagnoseSettings
         by_modes=p.error_apart if p.fails(limit) else 0.0,
         by_scatter=by_scatter,
         unpaired=judged.residuals.unexplained > MOST_UNEXPLAINED,
-        stands_still=observations.level_dependent and all(e.effect.linear for e in fit.model.effects),
+        stands_still=stands_still(observations, fit),
         damping=outlying_damping(observations, fit),
         parts=outlying_parts(observations, fit),
     )
+
+
+def stands_still(observations: Observations, fit: Fit) -> bool:
+    """True where modes are seen to move with the force, and nothing in the model moves them."""
+    return observations.level_dependent and all(e.effect.linear for e in fit.model.effects)
 
 
 def at_usual_scatters(observations: Observations, fit: Fit, of: Sequence[str] = _OF_TESTS) -> Fit:

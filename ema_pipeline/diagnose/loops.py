@@ -101,7 +101,10 @@ def loop_hypotheses(
     problem = observations.problem((), {})
     free = _free_columns(problem)
     groups: Groups = [(column, []) for column in free]
-    for placed in _placed(observations, library):
+    assembly = observations.rig.assembly(observations.isolator.configuration)
+    # the rig's own before generic ones
+    own = sorted((e for e in library.values() if not e.records_only), key=lambda e: e.generic)
+    for placed in (observations.scaled(PlacedEffect(e, at)) for e in own for at in e.find_places(assembly)):
         if placed.label not in skip and observations.isolator.shows(observations.rig, placed):
             put_among(groups, Name(placed, {}), _change(observations, placed))
     return tuple(
@@ -109,13 +112,6 @@ def loop_hypotheses(
         for k, (_, names) in enumerate(groups)
         if names and k >= len(free)
     )
-
-
-def _placed(observations: LoopObservations, library: Mapping[str, Effect]) -> list[PlacedEffect]:
-    """Effects at all their places, the rig's own before generic ones."""
-    assembly = observations.rig.assembly(observations.isolator.configuration)
-    own = sorted((e for e in library.values() if not e.records_only), key=lambda e: e.generic)
-    return [observations.scaled(PlacedEffect(e, place)) for e in own for place in e.find_places(assembly)]
 
 
 def _change(observations: LoopObservations, placed: PlacedEffect) -> NDArray[np.float64] | None:

@@ -28,6 +28,7 @@ _LEAST_FREQUENCY_STD = 1e-3
 _WORTH = 1.0
 """Difference, in standard deviations, below which a measurement is not worth proposing."""
 _CERTAIN = 0.9
+Systems = tuple[LinearSystem, ...]
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def _options(observations: ModeObservations, first: Fit, second: Fit) -> list[Op
         places = [*systems[0].dofs, *systems[0].sensors]
         shape_std = max(first.posterior.scatters[SHAPE], _LEAST_SHAPE_STD)
         for place in places:
-            if place in measured or not _known(systems[1], place):
+            if place in measured or place not in (*systems[1].dofs, *systems[1].sensors):
                 continue
             gap = _shape_gap(systems, data.band_hz, place) / shape_std
             options.append(Option(f"A sensor at {place} ({data.configuration})", gap))
@@ -108,13 +109,6 @@ def _options(observations: ModeObservations, first: Fit, second: Fit) -> list[Op
                 text = f"A mass of {scale * mass:.2g} {unit} added at {dof} ({data.configuration})"
                 options.append(Option(text, gap))
     return sorted(options, key=lambda o: -o.separation)
-
-
-Systems = tuple[LinearSystem, ...]
-
-
-def _known(system: LinearSystem, place: str) -> bool:
-    return place in system.dofs or place in system.sensors
 
 
 def _solved(system: LinearSystem, extra: tuple[str, float] | None = None) -> EigenSolution | None:

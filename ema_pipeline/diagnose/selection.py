@@ -61,11 +61,14 @@ class Earlier:
         Rounds in which these led.
     fitted : dict of str to Posterior
         Fits of hypotheses.
+    closed : bool
+        True where nothing else is asked about though they lead nowhere.
     """
 
     leading: tuple[Hypothesis, ...] = ()
     rounds: int = 0
     fitted: Mapping[str, Posterior] = field(default_factory=dict)
+    closed: bool = False
 
 
 def select(
@@ -119,15 +122,14 @@ def select(
             [j.ranked.fit for j in claimed[-1:]],
         )
         fitted.update({r.hypothesis.label: r.fit.posterior for r in ranking.ranked})
-        asked = _beside(observations, settings, claimed)
-        return round_of(observations, ranking, left, asked, len(claimed))
+        return round_of(observations, ranking, left, _beside(observations, settings, claimed), len(claimed))
 
     ahead: Round | None = None
     while True:
         leading = earlier.leading if len(claimed) < earlier.rounds and ahead is None else ()
         found, ahead = ahead or ask(base, claimed, rounds, leading), None
         leaders = _tentative(observations, found, settings)
-        if leading and found.best is None and not leaders:
+        if leading and not earlier.closed and found.best is None and not leaders:
             found = ask(base, claimed, rounds)
             leaders = _tentative(observations, found, settings)
         for leader in leaders if len(claimed) + 1 < settings.most_effects else ():

@@ -133,7 +133,7 @@ class AmplitudeObservations(Observations):
         return known._about(effects, found, rubbing), known._about(effects, found, self.rubbing)
 
     def friction_of(self, effect: PlacedEffect) -> frozenset[str]:
-        """Names of the elements that an effect adds, where all of them that depend on the amplitude are friction."""
+        """See `Observations`: none where anything else that it adds depends on the amplitude."""
         if effect.effect.linear:
             return frozenset()
         rig = self.modes.rig

@@ -119,6 +119,10 @@ class Observations(Protocol):
         """
         return None
 
+    def friction_of(self, effect: PlacedEffect) -> frozenset[str]:
+        """Names of the elements that an effect adds, where all are friction, which is known to first order only."""
+        return frozenset()
+
     def folds(self) -> Sequence[tuple[Observations, Observations]]:
         """Pairs of what is fitted and what is held out: a configuration, a hit point, a level, a share of modes."""
         ...

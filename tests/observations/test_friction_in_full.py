@@ -78,6 +78,24 @@ def test_friction_calculated_in_full_has_its_true_size(force: float) -> None:
 
 
 @pytest.mark.slow
+def test_friction_that_was_not_found_to_first_order_is_found_in_full() -> None:
+    observations, fit = linearised(0.1)
+    base = learned(observations, fit_base(observations, Model()))
+    labels = ["cubic_spring@hub.x", "dry_friction@rim", LABEL]
+    asked = [(parse_effect(label, RIG, library=shipped_effects()), {}) for label in labels]
+    found = in_full.friction_in_full(observations, base, asked)
+    assert found is not None
+    full, label, posterior = found
+    assert label == LABEL
+    assert set(full.rubbing) == {LABEL}
+    value, std = size(Fit(fit.model, posterior), full)
+    assert abs(value - 0.1) < 2 * std
+    # nothing that is asked about is friction; or what there is was calculated in full already
+    assert in_full.friction_in_full(observations, base, asked[:1]) is None
+    assert in_full.friction_in_full(full, base, asked[-1:]) is None
+
+
+@pytest.mark.slow
 def test_only_friction_is_calculated_in_full_and_once() -> None:
     observations, fit = linearised(0.1)
     cubic = parse_effect("cubic_spring@hub.x", RIG, library=shipped_effects())
