@@ -24,7 +24,7 @@ _KEEPING = frozenset(
 )
 """Verbs whose finished stages are kept, so that the same command goes on from there."""
 
-_ending: ContextVar[Callable[[], str]] = ContextVar("ending", default=str)
+_ending: ContextVar[Callable[[], str] | None] = ContextVar("ending", default=None)
 _go_on: ContextVar[str] = ContextVar("go_on", default="")
 
 
@@ -52,12 +52,14 @@ def answer_ctrl_c(program: str) -> None:
         if os.getpid() != own:  # a worker, which its parent outlives by no more than this
             os._exit(INTERRUPTED)
         signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
-        told = _ending.get()() or f"interrupted; {_how_to_go_on(program)}"
+        ending = _ending.get()
+        told = (ending and ending()) or f"interrupted; {_how_to_go_on(program)}"
         line = f"{_fresh_line()}ema: {printable(told)}\n"
         os.write(
             2, line.encode(errors="replace")
         )  # not through sys.stderr, which may be in the middle of a line
-        timer = threading.Timer(PATIENCE_S, os._exit, (INTERRUPTED,))
+        code = INTERRUPTED if ending is None else 0  # where Ctrl-C is how the command ends, it ends well
+        timer = threading.Timer(PATIENCE_S, os._exit, (code,))
         timer.daemon = True
         timer.start()
         sys.unraisablehook = lambda _: None  # raised in a callback, the interrupt would print a traceback

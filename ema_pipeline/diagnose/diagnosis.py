@@ -244,7 +244,7 @@ def _with_friction_in_full(
 ) -> Selection:
     """The selection from data for which friction is calculated in full, where that alone finds what moves the modes.
 
-    Marched beside every rival it takes minutes: nothing is asked about but what promised most.
+    Marched beside every rival it takes minutes: nothing is asked about beside it but what promised most.
     """
     if not stands_still(first.observations, first.final):
         return first
@@ -256,7 +256,7 @@ def _with_friction_in_full(
         return first
     full, label, friction = found
     asked = {r.hypothesis.label: r.hypothesis for r in ranked if r.final or r.hypothesis.label == label}
-    earlier = Earlier(tuple(asked.values()), settings.most_effects + 1, {label: friction}, closed=True)
+    earlier = Earlier((asked.pop(label), *asked.values()), settings.most_effects + 1, {label: friction}, True)
     again = select(full, known, hypotheses, settings, progress, earlier)
     return first if stands_still(again.observations, again.final) else again
 

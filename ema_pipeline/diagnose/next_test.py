@@ -93,9 +93,8 @@ def _options(observations: ModeObservations, first: Fit, second: Fit) -> list[Op
             for m, f in zip(models, (first, second), strict=True)
         )
         measured = {d.point for d in data.dofs}
-        places = [*systems[0].dofs, *systems[0].sensors]
         shape_std = max(first.posterior.scatters[SHAPE], _LEAST_SHAPE_STD)
-        for place in places:
+        for place in (*systems[0].dofs, *systems[0].sensors):
             if place in measured or place not in (*systems[1].dofs, *systems[1].sensors):
                 continue
             gap = _shape_gap(systems, data.band_hz, place) / shape_std

@@ -62,7 +62,7 @@ class Earlier:
     fitted : dict of str to Posterior
         Fits of hypotheses.
     closed : bool
-        True where nothing else is asked about though they lead nowhere.
+        True where the first of them is asked about alone, then all of them, and nothing else.
     """
 
     leading: tuple[Hypothesis, ...] = ()
@@ -126,7 +126,8 @@ def select(
 
     ahead: Round | None = None
     while True:
-        leading = earlier.leading if len(claimed) < earlier.rounds and ahead is None else ()
+        alone = 1 if earlier.closed and not claimed else None
+        leading = earlier.leading[:alone] if len(claimed) < earlier.rounds and ahead is None else ()
         found, ahead = ahead or ask(base, claimed, rounds, leading), None
         leaders = _tentative(observations, found, settings)
         if leading and not earlier.closed and found.best is None and not leaders:

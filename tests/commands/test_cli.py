@@ -899,6 +899,32 @@ def test_ctrl_c_ends_within_a_second_with_one_line_that_says_how_to_go_on(
     assert stage not in done.stdout.partition("Computed: ")[2].split(", ")[0]
 
 
+@pytest.mark.parametrize(
+    ("ending", "code", "told"),
+    [
+        ("", 130, "ema: interrupted; nothing was changed"),
+        ("end_by_ctrl_c(lambda: 'stopped')", 0, "ema: stopped"),
+    ],
+)
+def test_what_does_not_end_in_time_is_ended_with_the_code_of_its_command(
+    ending: str, code: int, told: str
+) -> None:
+    """A page ends well by Ctrl-C, on a busy machine as well."""
+    stuck = f"""
+import os, signal, time
+from ema_pipeline.commands.interrupts import answer_ctrl_c, end_by_ctrl_c
+answer_ctrl_c("ema")
+{ending}
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+except KeyboardInterrupt:
+    time.sleep(20)
+"""
+    done = subprocess.run([sys.executable, "-c", stuck], capture_output=True, text=True, timeout=15)
+    assert done.returncode == code
+    assert done.stderr.strip() == told
+
+
 def test_a_stage_of_another_kind_of_test_is_refused(
     results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
