@@ -41,7 +41,8 @@ def changes(
         typer.Option(
             "--repeat",
             metavar="KEY=VALUE",
-            help="How well tests repeat, 1 σ, learned about frequency=1e-4, damping=0.01, shape=0.003 if left out.",
+            help="How well tests repeat, 1 σ, learned about frequency=1e-4, damping=0.01, shape=0.003 if left out. "
+            "May be repeated.",
         ),
     ] = None,
     effect_file: EffectFiles = None,

@@ -17,13 +17,17 @@ if TYPE_CHECKING:
 Hits = Annotated[
     list[str] | None,
     typer.Option(
-        "--hit", metavar="CONFIGURATION/FILE#NUMBER", help="A hit, as the report's table of hits names it."
+        "--hit",
+        metavar="CONFIGURATION/FILE#NUMBER",
+        help="A hit, as the report's table of hits names it. May be repeated.",
     ),
 ]
 Modes = Annotated[
     list[str] | None,
     typer.Option(
-        "--mode", metavar="CONFIGURATION:HERTZ", help="A mode, by about its frequency (within 1 %)."
+        "--mode",
+        metavar="CONFIGURATION:HERTZ",
+        help="A mode, by about its frequency (within 1 %). May be repeated.",
     ),
 ]
 

@@ -21,10 +21,11 @@ EffectFiles = Annotated[
     typer.Option(
         "--effect-file",
         metavar="FILE.py",
-        help="A file with an effect of your own; its code runs in this call.",
+        help="A file with an effect of your own; its code runs in this call. May be repeated.",
     ),
 ]
 Overrides = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one setting of the pipeline.")
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override one setting of the pipeline. May be repeated."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]

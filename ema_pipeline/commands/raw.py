@@ -57,7 +57,9 @@ def simulate(
     rig: Annotated[str, typer.Option("--rig", "-r", metavar="RIG", help="Rig, or a rig file.")] = "planetary",
     configuration: Annotated[
         list[str] | None,
-        typer.Option("--configuration", "-c", metavar="NAME", help="Configuration; all if left out."),
+        typer.Option(
+            "--configuration", "-c", metavar="NAME", help="Configuration; all if left out. May be repeated."
+        ),
     ] = None,
     effect: Annotated[
         list[str] | None,
@@ -65,25 +67,26 @@ def simulate(
             "--effect",
             "-e",
             metavar="ID@PLACE:NAME=VALUE",
-            help="Hidden effect and its size; left out, one that shows clearly.",
+            help="Hidden effect and its size; left out, one that shows clearly. May be repeated.",
         ),
     ] = None,
     effect_file: EffectFiles = None,
     value: Annotated[
-        list[str] | None, typer.Option("--value", metavar="NAME=VALUE", help="True value of a parameter.")
+        list[str] | None,
+        typer.Option("--value", metavar="NAME=VALUE", help="True value of a parameter. May be repeated."),
     ] = None,
     sensor: Annotated[
-        list[str] | None, typer.Option("--sensor", metavar="DOF", help="DOF of a sensor.")
+        list[str] | None, typer.Option("--sensor", metavar="DOF", help="DOF of a sensor. May be repeated.")
     ] = None,
     impact: Annotated[
-        list[str] | None, typer.Option("--impact", metavar="DOF", help="DOF that is struck.")
+        list[str] | None, typer.Option("--impact", metavar="DOF", help="DOF that is struck. May be repeated.")
     ] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Setting of the test, e.g. sample_rate_hz=25600; all: ema settings simulate.",
+            help="Setting of the test, e.g. sample_rate_hz=25600; all: ema settings simulate. May be repeated.",
         ),
     ] = None,
     format_: Annotated[

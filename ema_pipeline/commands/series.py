@@ -186,7 +186,9 @@ def limits(
     tests: Annotated[
         list[str] | None,
         typer.Option(
-            "--test", metavar="TEST", help="A test of the good lot; all without a finding if left out."
+            "--test",
+            metavar="TEST",
+            help="A test of the good lot; all without a finding if left out. May be repeated.",
         ),
     ] = None,
     content: Annotated[float, typer.Option(help="Share of good tests within all limits together.")] = 0.95,
