@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from math import isfinite
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
@@ -26,6 +27,22 @@ def list_model_modes(rig: str, configuration: str | None) -> dict[str, list[dict
         ]
         for name in ((configuration,) if configuration else loaded.configurations)
     }
+
+
+def list_parameters(rig: str) -> list[dict[str, Any]]:
+    """The rig's parameters: value, relative 1 σ of it and of like parts about it, bounds; None where not stated."""
+    return [
+        {
+            "name": p.name,
+            "value": p.value,
+            "unit": p.unit,
+            "tolerance": None if p.free else p.tolerance,
+            "scatter": p.scatter,
+            "min": p.minimum,
+            "max": p.maximum if isfinite(p.maximum) else None,
+        }
+        for p in checked_rig(rig).parameters.values()
+    ]
 
 
 def list_effects(rig: str, effect_files: Iterable[str] = ()) -> list[dict[str, Any]]:

@@ -71,12 +71,22 @@ def model(
     configuration: Annotated[
         str | None, typer.Option("--configuration", "-c", help="Configuration; all if left out.")
     ] = None,
+    parameters: Annotated[
+        bool, typer.Option("--parameters", help="Show the rig's parameters with their tolerances instead.")
+    ] = False,
     json: Json = False,
 ) -> None:
-    """Show the modes of the model itself."""
-    from ema_pipeline.catalogue import list_model_modes
-    from ema_pipeline.report.listings import model_table
+    """Show the modes of the model itself, or its parameters."""
+    from ema_pipeline.catalogue import list_model_modes, list_parameters
+    from ema_pipeline.report.listings import model_table, parameters_table
 
+    if parameters:
+        stated = list_parameters(rig)
+        if json:
+            show_json({"parameters": stated})
+        else:
+            show(parameters_table(stated))
+        return
     listed = list_model_modes(rig, configuration)
     if json:
         first = next(iter(listed.values()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from math import inf
 from typing import Any
 
 from rich import box
@@ -12,6 +13,8 @@ from rich.console import Console, Group, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
+
+from ema_pipeline.number_text import prefixed
 
 ReportProgress = Callable[[float, str], None]
 
@@ -64,6 +67,36 @@ def model_table(configuration: str, modes: Sequence[dict[str, Any]]) -> Renderab
         damping = 100 * mode["damping_ratio"]
         table.add_row(str(number), f"{mode['frequency_hz']:.2f}", f"{damping:.3f}", mode["family"])
     return table
+
+
+def parameters_table(parameters: Sequence[dict[str, Any]]) -> RenderableType:
+    """A rig's parameters with their tolerances, and how far single parts scatter about them."""
+    table = Table(
+        title="Parameters of the rig",
+        caption="tolerance: 1 σ of the value, free where only data tell it; parts: 1 σ of single parts about it, "
+        "– where not stated",
+        box=box.SIMPLE,
+        title_justify="left",
+        caption_justify="left",
+    )
+    table.add_column("parameter", no_wrap=True)
+    for column in ("value", "tolerance", "parts", "range"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for p in parameters:
+        factor, unit = prefixed(p["value"], p["unit"])
+        least, most = (f"{factor * bound:.4g}" for bound in (p["min"], inf if p["max"] is None else p["max"]))
+        table.add_row(
+            p["name"],
+            f"{factor * p['value']:.4g} {unit if unit != '1' else ''}".strip(),
+            "free" if p["tolerance"] is None else _percent(p["tolerance"]),
+            "–" if p["scatter"] is None else _percent(p["scatter"]),
+            f"{least} … {most.replace('inf', '∞')}",
+        )
+    return table
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %" if share else "exact"
 
 
 @contextmanager

@@ -371,6 +371,22 @@ def test_check_shows_a_verdict_table_and_writes_nothing(
     assert sorted(p.name for p in small_raw.iterdir()) == before
 
 
+def test_model_lists_the_parameters_of_a_rig(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = ema(capsys, "model", "--rig", "planetary", "--parameters")
+    assert code == 0
+    rows = {line.split()[0]: " ".join(line.split()[1:]) for line in out.splitlines() if line.strip()}
+    assert rows["planet_mass"] == "0.43 kg 1 % – 0 … ∞"
+    assert rows["sun_planet_mesh_stiffness"] == "10 MN/m free – 1 … 1000"
+    assert rows["pressure_angle_deg"] == "20 deg exact – 0 … 45"
+    assert max(map(len, out.splitlines())) <= 80
+    code, out, _ = ema(capsys, "model", "--rig", "planetary", "--parameters", "--json")
+    told = {p["name"]: p for p in json.loads(out)["parameters"]}
+    assert told["planet_mass"] == {
+        "name": "planet_mass", "value": 0.43, "unit": "kg", "tolerance": 0.01, "scatter": None, "min": 0.0, "max": None,
+    }  # fmt: skip
+    assert told["sun_planet_mesh_stiffness"]["tolerance"] is None
+
+
 def test_the_model_command_gives_the_seeds_frequencies_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = ema(capsys, "model", "--rig", "planetary", "--configuration", "no_ring", "--json")
     assert code == 0
