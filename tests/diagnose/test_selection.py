@@ -22,7 +22,7 @@ from ema_pipeline.diagnose.claims import (
 from ema_pipeline.diagnose.diagnosis import _candidates, _ended, _first_probabilities, _groups
 from ema_pipeline.diagnose.ranked import Ranked, Ranking
 from ema_pipeline.diagnose.rounds import Round
-from ema_pipeline.diagnose.selection import Selection, _beside, select
+from ema_pipeline.diagnose.selection import Earlier, Selection, _beside, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import NOTHING, EffectSize
 from ema_pipeline.diagnose.verdict import alike
@@ -196,9 +196,37 @@ class Steps:
         self.shares.append((len(among), settings.claim, found))
         return Round(ranking, tuple(self.rounds[found]), {})
 
-    def select(self, hypotheses: list[Any], settings: DiagnoseSettings, told: list[float]) -> Selection:
+    def select(
+        self,
+        hypotheses: list[Any],
+        settings: DiagnoseSettings,
+        told: list[float],
+        earlier: Earlier | None = None,
+    ) -> Selection:
         known: Any = SimpleNamespace(effects=(), name="base")
-        return select(self.observations, known, hypotheses, settings, lambda share, text: told.append(share))
+
+        def progress(share: float, text: str) -> None:
+            told.append(share)
+
+        return select(self.observations, known, hypotheses, settings, progress, earlier or Earlier())
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_what_is_asked_about_alone_is_all_that_is_asked_about_where_nothing_else_may_be(
+    closed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    a, b, c = judged("a@x", 20.0), judged("b@y", 9.0, "weak"), judged("c@z", 8.0, "weak")
+    steps = Steps(monkeypatch, [[a], [b]])
+    earlier = Earlier((a.hypothesis, b.hypothesis), 4, closed=closed)
+    found = steps.select([j.hypothesis for j in (c, b, a)], SETTINGS, [], earlier)
+    assert found.claimed == (a,)
+    asked = [labels for labels, _ in steps.asked]
+    # else all that led is asked about at once, and everything where that leads nowhere
+    assert asked == ([["a@x"], ["b@y"]] if closed else [["b@y", "a@x"], ["b@y"], ["c@z", "b@y"]])
+    assert {among for among, _, found in steps.shares if not found} == {3}  # the others keep their prior
+    steps = Steps(monkeypatch, [[b]])
+    assert steps.select([j.hypothesis for j in (c, b, a)], SETTINGS, [], earlier).claimed == ()
+    assert len(steps.asked) == (1 if closed else 2)
 
 
 def test_effects_are_added_one_by_one_until_nothing_more_is_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
