@@ -141,7 +141,7 @@ def judge(
         asked = observations.holding_out_explained(base.posterior.residuals)
         before, after = held_out_of_each(asked, [base, mended], settings.processes)
         left = left_of_close_modes(base, mended)
-        share = LINEARISED_SHARE if _linearised(observations, ranked.hypothesis) else HELD_OUT_SHARE
+        share = LINEARISED_SHARE if linearised(observations, ranked.hypothesis) else HELD_OUT_SHARE
         tie = HELD_OUT_TIE + share * max(min(gain, left), 0.0)
         doubt = _contradicted(base, mended, before, after, tie)
         if not doubt and left < needed:
@@ -190,14 +190,14 @@ def doubt_of_nothing(nothing: float, settings: DiagnoseSettings) -> str:
 
 def sigmas_asked(observations: Observations, hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:
     """Distance from nothing that a claim asks of a size, in its standard deviations."""
-    return settings.linearised_sigmas if _linearised(observations, hypothesis) else settings.sigmas
+    return settings.linearised_sigmas if linearised(observations, hypothesis) else settings.sigmas
 
 
 def doubtful_evidence(
     of: Observations | Ranking, hypothesis: Hypothesis, settings: DiagnoseSettings
 ) -> float:
     """Log evidence that an effect may gain from what equivalent linearisation leaves out."""
-    return settings.linearised_claim if _linearised(of, hypothesis) else 0.0
+    return settings.linearised_claim if linearised(of, hypothesis) else 0.0
 
 
 def evidence_beyond(observations: Observations, hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:
@@ -209,9 +209,9 @@ def evidence_beyond(observations: Observations, hypothesis: Hypothesis, settings
     return (2 if hypothesis.generic else 1) * doubtful_evidence(observations, hypothesis, settings)
 
 
-def _linearised(of: Observations | Ranking, hypothesis: Hypothesis) -> bool:
+def linearised(of: Observations | Ranking, hypothesis: Hypothesis) -> bool:
     """True where equivalent linearisation alone tells what the effect does."""
-    return of.linearised and not hypothesis.placed.effect.linear
+    return not hypothesis.placed.effect.linear and of.linearised
 
 
 def _std_of_first(ranked: Ranked) -> float:

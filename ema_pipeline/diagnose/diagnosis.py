@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import softmax
 
 from ema_pipeline.diagnose import sentences
-from ema_pipeline.diagnose.claims import Judged
+from ema_pipeline.diagnose.claims import Judged, linearised
 from ema_pipeline.diagnose.detection_limits import detection_limits
 from ema_pipeline.diagnose.explained import explanation, stands_still
 from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
@@ -333,7 +333,7 @@ def _candidates(
 
 def _stated(found: Selection, j: Judged) -> dict[str, EffectSize]:
     """Sizes of what is not in the model, as they would be stated if it were."""
-    by_motion = not j.hypothesis.placed.effect.linear and found.observations.linearised
+    by_motion = linearised(found.observations, j.hypothesis)
     return {n: as_calculated(s) if by_motion else s for n, s in j.named.sizes.items()}
 
 

@@ -10,7 +10,7 @@ from operator import is_
 import numpy as np
 
 from ema_pipeline.diagnose.backward import alike_beside, cannot_be_told, reconsidered
-from ema_pipeline.diagnose.claims import BY_OTHERS, Judged, judge
+from ema_pipeline.diagnose.claims import BY_OTHERS, Judged, judge, linearised
 from ema_pipeline.diagnose.first_fits import CONTINUED
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.probability import most_doubt
@@ -194,7 +194,7 @@ def _beside(
     observations: Observations, settings: DiagnoseSettings, claimed: Sequence[Judged]
 ) -> DiagnoseSettings:
     """What is asked of a further effect beside those that are claimed."""
-    gains = [j.gain for j in claimed if observations.linearised and not j.hypothesis.placed.effect.linear]
+    gains = [j.gain for j in claimed if linearised(observations, j.hypothesis)]
     left = settings.linearised * sum(gains) + (settings.linearised_claim if gains else 0.0)
     doubt = most_doubt(settings, len(claimed))
     return settings.model_copy(update={"claim": settings.claim + left, "doubt": doubt})

@@ -157,9 +157,9 @@ def without_faint(
     usual = [squares[track[linear]] for track in tracks if track[0] >= 0]
     least = HARDLY_MOVES * float(np.median(usual)) if usual else 0.0
     made = [track for track in tracks if track[0] < 0 and squares[track[linear]] < least]
-    drop = [{int(track[k]) for track in made if track[k] >= 0} for k in range(len(models))]
     if not made:
         return tuple(levels), ()
+    drop = [{int(track[k]) for track in made if track[k] >= 0} for k in range(len(models))]
     poles = ", ".join(f"{hz:.4g}" for hz in sorted(hard.modes[track[linear]].frequency_hz for track in made))
     return _without(levels, drop), (f"{poles} Hz (hardly moving)",)
 

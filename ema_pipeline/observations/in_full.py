@@ -72,14 +72,12 @@ def friction_in_full(
     for placed, scales in itertools.islice(asked.values(), _MOST_PLACES):
         model = base.model.plus(placed, scales)
         unknowns = model.problem(observations).unknowns
-        linear = refined(observations, model, transferred(base.posterior, unknowns), scatters)
-        both = observations.in_full(model.effects, linear.posterior)
+        plain = transferred(base.posterior, unknowns)
+        both = observations.in_full(model.effects, refined(observations, model, plain, scatters).posterior)
         if both is None:
             continue
         full, linearised = both
         without = refined(linearised, base.model, base.posterior.x, scatters)
-        unknowns = model.problem(full).unknowns
-        plain = transferred(base.posterior, unknowns)
         i = unknowns.index[placed.parameter_name(placed.effect.parameters[0].name)]
         starts = [np.where(np.arange(len(plain)) == i, size, plain) for size in _FORCES]
         fit = best_refined(full, model, starts, scatters, processes)
